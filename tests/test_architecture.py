@@ -1,6 +1,7 @@
 """The rules of the house, checked on the source as it stands: one test a rule, which lists who breaks it."""
 
 import ast
+import graphlib
 import inspect
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("nerf", "stages", "pipeline")
 MAY_IMPORT = {"nerf": {"nerf"}, "stages": {"nerf", "stages"}, "pipeline": {"nerf", "stages", "pipeline"}}
+PIPELINE_ORDER = ("schedule", "engine", "doctor", "demo", "cli", "__main__")  # each imports those before it alone
 NERF_MAY_USE = {"torch", "numpy", "jaxtyping"}
 DISK = {"pathlib", "os", "io", "shutil", "tempfile"}
 KERNELS = "nerf/kernels/warp/"  # alone may use Warp, whose kernels name all their arrays
@@ -93,6 +95,55 @@ def renamed_imports(module: Module) -> Iterator[str]:
         for alias in node.names:
             if alias.asname and alias.name.islower() and alias.name not in BACKENDS:
                 yield f"{node.module}.{alias.name} as {alias.asname}"
+
+
+def dotted(module: Module) -> str:
+    return module.name.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+
+
+def modules_imported(module: Module, known: set[str]) -> set[str]:
+    """Modules among ``known`` that this one imports as it runs, at its top or in a function."""
+    only_for_types = {
+        id(node)
+        for test in ast.walk(module.tree)
+        if isinstance(test, ast.If) and ast.unparse(test.test) == "TYPE_CHECKING"
+        for node in ast.walk(test)
+    }
+    found: set[str] = set()
+    for node in ast.walk(module.tree):
+        if id(node) in only_for_types:
+            continue
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            inside = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {name if name in known else node.module for name in inside}
+    return found & known
+
+
+def cycle(modules: Iterable[Module]) -> list[str]:
+    """Modules that import each other in a circle; [] where there are none."""
+    by_name = {dotted(module): module for module in modules}
+    graph = {name: modules_imported(module, set(by_name)) - {name} for name, module in by_name.items()}
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def imports_out_of_order(module: Module) -> Iterator[str]:
+    """Of modules of pipeline, what they import of packages of it that stand after theirs."""
+    parts = dotted(module).split(".")
+    if parts[0] != "pipeline" or len(parts) < 2:
+        return
+    names = [node.module or "" for node in ast.walk(module.tree) if isinstance(node, ast.ImportFrom)]
+    for name in (name.split(".") for name in names):
+        later = (
+            PIPELINE_ORDER.index(parts[1]) < PIPELINE_ORDER.index(name[1]) if name[0] == "pipeline" and name[1:] else 0
+        )
+        if later:
+            yield f"imports {'.'.join(name)}"
 
 
 def imports_against_the_current(module: Module) -> Iterator[str]:
@@ -177,6 +228,18 @@ def test_imports_go_one_way():
     assert offenders(imports_against_the_current, OURS) == []
 
 
+def test_no_modules_import_each_other_in_a_circle():
+    assert cycle(OURS) == []
+    circle = [module("a.py", "def f():\n    from b import g"), module("b.py", "import a"), module("c.py", "import a")]
+    assert set(cycle(circle)) == {"a", "b"}
+    types = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import b"
+    assert cycle([module("a.py", types), module("b.py", "import a")]) == []
+
+
+def test_packages_of_pipeline_import_one_way():
+    assert offenders(imports_out_of_order, OURS) == []
+
+
 def test_what_is_imported_keeps_its_name():
     assert offenders(renamed_imports, [*OURS, *AROUND]) == []
 
@@ -231,6 +294,7 @@ def test_no_division_hides_a_zero():
 MANY = ", ".join("abcdefghi")
 BROKEN: dict[Rule, list[tuple[str, str]]] = {
     imports_against_the_current: [("nerf/a.py", "def f():\n    import stages.io"), ("stages/a.py", "import pipeline")],
+    imports_out_of_order: [("pipeline/engine/a.py", "def f():\n    from pipeline.cli.arguments import x")],
     renamed_imports: [
         ("tests/a.py", "from stages.io import photos as module"),
         ("pipeline/a.py", "from stages import train as trained"),

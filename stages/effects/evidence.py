@@ -1,9 +1,6 @@
 """All statistics of a scene: what its sparse model and its training photos say about each optional effect."""
 
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,7 +18,6 @@ from nerf.effects.statistics.tracks import TrackColours
 from nerf.effects.statistics.transients import Odd, odd_photos, transients_evidence
 from nerf.effects.statistics.vignetting import vignetting_evidence
 from stages.contract import Progress
-from stages.effects.effect_list import EFFECTS
 from stages.effects.track_colours import look_at_photos
 from stages.io.photos import read_photos
 from stages.sfm.colmap.cameras import project
@@ -60,57 +56,6 @@ class Observations(NamedTuple):
     exif_ev: np.ndarray
     gradients: np.ndarray
     places: Places
-
-
-class SceneEvidence(NamedTuple):
-    """The evidence by effect and warning, what effects begin with (training photos in order, numbers), and the
-    ``seconds`` that the evidence took."""
-
-    of: dict[str, Evidence]
-    measured: dict[str, np.ndarray]
-    seconds: dict[str, float]
-
-
-class Clock:
-    """Seconds by effect; of what serves several, each has an equal part."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def runs_for(self, *names: str) -> Iterator[None]:
-        """While the block lasts."""
-        started = time.perf_counter()
-        yield
-        part = (time.perf_counter() - started) / len(names)
-        for name in names:
-            self.seconds[name] = self.seconds.get(name, 0.0) + part
-
-    def timed(self, statistics: Mapping[str, Callable[[], Evidence]]) -> dict[str, Evidence]:
-        """What each of them says; each counts for its own name."""
-        said = {}
-        for name, statistic in statistics.items():
-            with self.runs_for(name):
-                said[name] = statistic()
-        return said
-
-
-def scene_evidence(
-    ingest: Path,
-    scene: "Scene",
-    points: Mapping[str, np.ndarray],
-    uncertainty_px: Mapping[str, float | None],
-    progress: Progress,
-) -> SceneEvidence:
-    """Everything that can be told without training. ``points`` is points.safetensors, ``uncertainty_px`` what
-    registration.json says of each photo by its file (``images/…``)."""
-    clock, parts = Clock(), {effect.name: effect.load() for effect in EFFECTS}
-    with clock.runs_for(*parts, *WARNINGS):
-        seen = observed(ingest, scene, points, uncertainty_px, progress)
-    statistics = {name: each.statistic for name, each in parts.items()} | WARNINGS
-    of = clock.timed({name: partial(statistic, seen) for name, statistic in statistics.items()})
-    measured = {name: each.measured(seen) for name, each in parts.items() if each.measured}
-    return SceneEvidence(of, measured, clock.seconds)
 
 
 def observed(

@@ -2,8 +2,13 @@
 
 import math
 import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from nerf.effects.statistics.statistic import Evidence
 from nerf.geometry.scene import Scene
@@ -17,6 +22,57 @@ from stages.io.files import read_tensors, write_json
 
 if TYPE_CHECKING:
     from stages.effects import Config
+
+
+class SceneEvidence(NamedTuple):
+    """The evidence by effect and warning, what effects begin with (training photos in order, numbers), and the
+    ``seconds`` that the evidence took."""
+
+    of: dict[str, Evidence]
+    measured: dict[str, np.ndarray]
+    seconds: dict[str, float]
+
+
+class Clock:
+    """Seconds by effect; of what serves several, each has an equal part."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def runs_for(self, *names: str) -> Iterator[None]:
+        """While the block lasts."""
+        started = time.perf_counter()
+        yield
+        part = (time.perf_counter() - started) / len(names)
+        for name in names:
+            self.seconds[name] = self.seconds.get(name, 0.0) + part
+
+    def timed(self, statistics: Mapping[str, Callable[[], Evidence]]) -> dict[str, Evidence]:
+        """What each of them says; each counts for its own name."""
+        said = {}
+        for name, statistic in statistics.items():
+            with self.runs_for(name):
+                said[name] = statistic()
+        return said
+
+
+def scene_evidence(
+    ingest: Path,
+    scene: Scene,
+    points: Mapping[str, np.ndarray],
+    uncertainty_px: Mapping[str, float | None],
+    progress: Progress,
+) -> SceneEvidence:
+    """Everything that can be told without training. ``points`` is points.safetensors, ``uncertainty_px`` what
+    registration.json says of each photo by its file (``images/…``)."""
+    clock, parts = Clock(), {effect.name: effect.load() for effect in EFFECTS}
+    with clock.runs_for(*parts, *evidence.WARNINGS):
+        seen = evidence.observed(ingest, scene, points, uncertainty_px, progress)
+    statistics = {name: each.statistic for name, each in parts.items()} | evidence.WARNINGS
+    of = clock.timed({name: partial(statistic, seen) for name, statistic in statistics.items()})
+    measured = {name: each.measured(seen) for name, each in parts.items() if each.measured}
+    return SceneEvidence(of, measured, clock.seconds)
 
 
 class Verdict(NamedTuple):
@@ -35,7 +91,7 @@ def study(
     started = time.perf_counter()
     uncertainty = {f"images/{image['file']}": image.get("uncertainty_px") for image in registration["images"]}
     points = read_tensors(inputs["normalise"] / "points.safetensors")
-    found = evidence.scene_evidence(inputs["ingest"], scene, points, uncertainty, progress)
+    found = scene_evidence(inputs["ingest"], scene, points, uncertainty, progress)
     statistics_seconds = time.perf_counter() - started
     decisions, verdicts = _Study(config, scene, inputs, found, progress).decide()
     write_decisions(folder, decisions)
@@ -57,7 +113,7 @@ class _Study:
         config: "Config",
         scene: Scene,
         inputs: Inputs,
-        found: evidence.SceneEvidence,
+        found: SceneEvidence,
         progress: Progress,
     ) -> None:
         self.config, self.scene, self.inputs, self.found, self.progress = config, scene, inputs, found, progress

@@ -11,10 +11,10 @@ from nerf.training.trainer import NonFinite
 from pipeline.engine import manifests
 from pipeline.engine.keys import stage_key
 from stages import effects, train
-from stages.effects import evidence, pilots, study
+from stages.effects import pilots, study
 from stages.effects.decisions import Decisions, read_decisions, write_decisions
-from stages.effects.evidence import SceneEvidence
 from stages.effects.pilots import Pilot
+from stages.effects.study import SceneEvidence
 from stages.io.files import write_json
 from tests.effect_scenes import Effects, effect_scene
 from tests.stages.photo_scene import photographed
@@ -44,7 +44,7 @@ def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
         told = {name: found(value) for name, value in CLEAR.items()} | given
         measured = {"exposure": np.full((count, 3), 0.5)}
         took = {name: 0.25 if name == "exposure" else 0.5 for name in told}
-        monkeypatch.setattr(evidence, "scene_evidence", lambda *_: SceneEvidence(told, measured, took))
+        monkeypatch.setattr(study, "scene_evidence", lambda *_: SceneEvidence(told, measured, took))
         tried: list[str] = []
 
         def run_pilot(_trial: object, off: Decisions, on: Decisions, *_rest: object) -> Pilot:

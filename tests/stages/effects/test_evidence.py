@@ -10,13 +10,13 @@ import pytest
 from nerf.effects.statistics.statistic import Evidence
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages.effects.evidence import (
-    Clock,
     lens_evidence,
     observed_places,
     pose_statistic,
     rolling_shutter_statistic,
     unless_pixels_differ,
 )
+from stages.effects.study import Clock
 from stages.io.photos import Photo, write_photos
 from tests.stages.photo_scene import pose_towards_origin
 

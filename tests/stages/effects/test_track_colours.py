@@ -11,7 +11,8 @@ import stages.effects.track_colours
 from nerf.effects.statistics import transients
 from nerf.effects.statistics.exposure import EV, fit_exposure
 from nerf.geometry.scene import Camera, Scene, View
-from stages.effects.evidence import scene_evidence, training_residuals
+from stages.effects.evidence import training_residuals
+from stages.effects.study import scene_evidence
 from stages.effects.track_colours import (
     BRIGHTEST,
     CLIPPED_SHARE,
