@@ -211,7 +211,7 @@ def test_json_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert code == 10
     assert events[-1]["event"] == "error"
-    assert set(events[-1]) == {"event", "stage", "what", "why", "hint"}
+    assert set(events[-1]) == {"event", "stage", "code", "what", "why", "hint"}
 
 
 @pytest.mark.parametrize(
@@ -228,7 +228,7 @@ def test_errors_outside_of_stages_are_events_too(
     assert run_command([*words, "--json"]) == code
     captured = capsys.readouterr()
     (event,) = map(json.loads, captured.out.splitlines())
-    assert set(event) == {"event", "stage", "what", "why", "hint"}
+    assert set(event) == {"event", "stage", "code", "what", "why", "hint"}
     assert (event["event"], event["stage"]) == ("error", None)
     assert event["what"].startswith(what) and captured.err == ""
 
