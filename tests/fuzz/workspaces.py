@@ -50,7 +50,7 @@ def run_file() -> dict[str, Any]:
     options = Settings().model_dump(mode="json")
     keys = dict.fromkeys(options, "0" * 64)
     return {
-        "version": 1,
+        "version": 2,
         "options": options,
         "plans": {"train": {"0": {"steps": 5}}},
         "keys": keys,

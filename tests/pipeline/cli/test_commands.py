@@ -300,7 +300,7 @@ def test_what_lies_beside_known_cameras_changes_nothing(tmp_path: Path, capsys: 
     for name in ("itself", "again"):  # as many paths as there are ways through them
         (tmp_path / "cameras" / name).symlink_to(tmp_path / "cameras")
     words = ("--cameras", str(tmp_path / "cameras"), "--until", "ingest")
-    assert "cameras given" in run_on(tmp_path / "photos", capsys, *words)[1]
+    assert "poses imported" in run_on(tmp_path / "photos", capsys, *words)[1]
     (tmp_path / "cameras/notes.txt").write_text("of no matter")
     assert "nothing to do" in run_on(tmp_path / "photos", capsys, *words)[1]
     assert "one camera" in run_on(tmp_path / "photos", capsys, "--until", "ingest")[1]
