@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from stages.io.sparse_model import SparseModel
 
 INPUTS = ("ingest", "sfm")
-VERSION = 15
+VERSION = 16
 EXIT_CODE = 12
 RESUMES = False
 PUBLISHED = ("transforms.json", "scene.json")
