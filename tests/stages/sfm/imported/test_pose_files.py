@@ -294,6 +294,30 @@ def test_poses_are_those_of_the_file_whatever_else_is_in_it(read, program: str) 
         np.testing.assert_array_equal(one.sfm_from_camera, other.sfm_from_camera)
 
 
+SIZE = {"w": W, "h": H}
+RADIAL = {"k1": 0.1, "k2": 0.02, "k3": 0.003, "k4": 0.0, "p1": 0.01, "p2": -0.01}
+BY_CONVERTERS = {  # what nerfstudio's write: the file's values, the frame's, the camera
+    "polycam": ({"orientation_override": "none"}, LENS | SIZE, ("PINHOLE", (50, 52, 31, 19))),
+    "metashape": (LENS | SIZE | RADIAL, {}, ("FULL_OPENCV", (50, 52, 31, 19, 0.1, 0.02, 0.01, -0.01, 0.003, 0, 0, 0))),
+    "realitycapture": (
+        SIZE | {"orientation_override": "none"},
+        LENS | {key: str(value) for key, value in RADIAL.items()},  # a table's fields, as text
+        ("FULL_OPENCV", (50, 52, 31, 19, 0.1, 0.02, 0.01, -0.01, 0.003, 0, 0, 0)),
+    ),
+}
+
+
+@pytest.mark.parametrize("program", BY_CONVERTERS)
+def test_files_of_nerfstudios_converters_are_read(read, program: str) -> None:
+    of_file, of_frame, expected = BY_CONVERTERS[program]
+    known = read([frame(i, **of_frame) for i in range(3)], camera_model="OPENCV", **of_file)
+    (camera,) = known.model.cameras
+    assert (camera.model, camera.width, camera.height) == (expected[0], W, H) and known.notes == []
+    assert camera.params == pytest.approx(expected[1])
+    for index, image in enumerate(known.model.images):
+        np.testing.assert_allclose(image.sfm_from_camera, matrix(index)[:3] * [1, -1, -1, 1], atol=1e-12)
+
+
 def test_a_matrix_may_be_a_flat_list_of_its_rows(read) -> None:
     flat = read([frame(i, transform_matrix=matrix(i).ravel().tolist()) for i in range(3)], **LENS)
     plain = read([frame(i) for i in range(3)], **LENS)
