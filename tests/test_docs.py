@@ -13,6 +13,8 @@ from nerf.geometry.scene import Camera, Scene, Similarity, View
 from pipeline.engine.stage_list import STAGES
 from stages import evaluate
 from stages.io.photos import Photo
+from tests.test_architecture import OURS
+from tests.wording import code_of, made
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -24,6 +26,8 @@ LINK = re.compile(r"\]\(([^)\s]+)\)")
 OPTION = re.compile(rf"--({'|'.join(STAGES)})\.([a-z][a-z0-9_-]*)")
 CALL = re.compile(r"(?m)^(?:\w+ = )?run\((\w+), \1\.Config\(.*?\)(?:, \[(.*)\])?\)$")
 CODE = re.compile(r"(?ms)^```(\w*)$\n(.*?)^```$\n")
+TEST = re.compile(r"`(tests/[\w/]+\.py)::(\w+)`")
+ERROR = re.compile(r"`((?:ingest|io|sfm|render|mesh|normalise)\.[a-z]+(?:-[a-z]+)+)`")
 MODULE = re.compile(r"(?m)^\| `((?:nerf|stages|pipeline)/[\w/]+\.py)` \|")
 
 
@@ -161,6 +165,18 @@ def test_examples_of_files_name_every_key():
     }
     shown = {name: set(re.findall(r'"(\w+)"', page.split(f"## {name} ")[1].split("\n## ")[0])) for name in wanted}
     assert {name: keys - shown[name] for name, keys in wanted.items() if keys - shown[name]} == {}
+
+
+def test_formats_name_tests_and_codes_that_exist():
+    page = (ROOT / "docs" / "FORMATS.md").read_text("utf-8").replace("TESTS/", "tests/stages/")
+    tests = set(TEST.findall(page))
+    gone = [f"{path}::{name}" for path, name in tests if f"\ndef {name}(" not in (ROOT / path).read_text("utf-8")]
+    assert len(tests) > 60 and gone == []
+    codes = {code_of(call, module) for module in OURS for call in made(module.tree)}
+    named = set(ERROR.findall(page))
+    assert len(named) > 30 and named <= codes, named - codes
+    rows = [row for row in page.splitlines() if row.startswith("| ") and not row.endswith((" test |", " out |"))]
+    assert [row for row in rows if "::" not in row and "](#" not in row] == []
 
 
 def test_the_checks_can_fail(tmp_path: Path):

@@ -66,8 +66,8 @@ def read_mask(file: Path, width: int, height: int, orientation: int, stored: boo
         light = np.rint(light * (decoded.pixels[..., 3] / 255.0)).astype(np.uint8)
     if light.max() == 1:  # a mask of 0 and 1
         light = 255 * light
-    if marks_ignored(file.name):
-        light = 255 - light
+    if marks_ignored(file.name):  # all that is not black, as instant-ngp has it
+        light = np.where(light > 0, np.uint8(0), np.uint8(255))
     pixels = np.where(light >= USE_FROM, np.uint8(255), np.uint8(0))
     size, found = (width, height), (pixels.shape[1], pixels.shape[0])
     fits, fits_stored = _same_shape(found, size), _same_shape(found, _stored(size, orientation))

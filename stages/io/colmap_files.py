@@ -75,7 +75,7 @@ class ModelFiles(NamedTuple):
 def read_model_files(folder: Path) -> ModelFiles:
     """The model in ``folder``, checked to be one: places somewhere, every id there once, every image with a camera and
     points that exist. Raises OSError, and ValueError or OverflowError with the reason."""
-    binary = (folder / "cameras.bin").is_file()
+    binary = _is_binary(folder)
     readers = (
         {"cameras": _binary_cameras, "images": _binary_images, "points3D": _binary_points}
         if binary
@@ -100,12 +100,17 @@ def read_model_files(folder: Path) -> ModelFiles:
 
 def image_names(folder: Path) -> list[str]:
     """The names of the images of the model in ``folder``; none where its file of images is damaged."""
-    binary = (folder / "images.bin").is_file()
-    images = _binary_images(folder / "images.bin") if binary else _text_images(folder / "images.txt")
+    images = _binary_images(folder / "images.bin") if _is_binary(folder) else _text_images(folder / "images.txt")
     try:
         return [image.name for _, image in images]
     except (OSError, struct.error, ValueError, OverflowError):
         return []
+
+
+def _is_binary(folder: Path) -> bool:
+    """Whether the model's binary files count, of which one alone does not stand in for text that is complete."""
+    binary, text = ([(folder / f"{part}{end}").is_file() for part in ("cameras", "images")] for end in (".bin", ".txt"))
+    return all(binary) or (any(binary) and not all(text))
 
 
 def _by_id(entries: Iterator[tuple[int, Entry]]) -> dict[int, Entry]:

@@ -7,6 +7,8 @@ import numpy as np
 from nerf.geometry.scene import Camera, Scene
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])  # x right, y up, z backward; its own inverse
+# As k1 of a fisheye without terms: instant-ngp takes one for a pinhole where all of them are 0. No pixel moves by it.
+TINY_TERM = 1e-12
 
 # The parameters of COLMAP's camera models under the format's names, and the format's model that reads them.
 _MODELS = {
@@ -88,4 +90,6 @@ def intrinsics(camera: Camera) -> dict[str, Any]:
     if camera.model in _NEAREST:
         values["note"] = f"approximation: {camera.model} with parameters {list(camera.params)} has no counterpart here"
     fisheye = {"is_fisheye": True} if model == "OPENCV_FISHEYE" else {}  # instant-ngp reads no camera_model
+    if fisheye and not any(values.get(f"k{i}") for i in range(1, 5)):
+        values["k1"] = TINY_TERM
     return {"camera_model": model, **fisheye, "w": camera.width, "h": camera.height} | values

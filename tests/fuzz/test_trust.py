@@ -12,6 +12,7 @@ from PIL import Image
 
 from pipeline.cli.commands import run_command
 from pipeline.engine.manifests import BadManifest, Manifest, check_outputs, outputs_digest, read, sealed
+from pipeline.engine.run_file import VERSION
 from pipeline.engine.workspace import Workspace
 from stages.contract import StageError
 from stages.ingest.sources import find_source
@@ -161,7 +162,7 @@ def test_a_workspace_with_links_in_it_is_left_alone(
     root = tmp_path / "w.nerf"
     (root / link).parent.mkdir(parents=True)
     (root / link).symlink_to(tmp_path / "home")
-    (root / "run.json").write_text(json.dumps({"version": 1, "options": {}, "plans": {}, "keys": {}}))
+    (root / "run.json").write_text(json.dumps({"version": VERSION, "options": {}, "plans": {}, "keys": {}}))
     for command in (["clean", str(root)], ["resume", str(root)], ["status", str(root)]):
         assert run_command(command) == 3
         assert f"{root / link} is a link" in capsys.readouterr().err

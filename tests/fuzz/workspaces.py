@@ -45,12 +45,13 @@ def try_run(folder: Path) -> None:
 @cache
 def run_file() -> dict[str, Any]:
     """A valid run.json."""
+    from pipeline.engine.run_file import VERSION
     from pipeline.engine.settings import Settings
 
     options = Settings().model_dump(mode="json")
     keys = dict.fromkeys(options, "0" * 64)
     return {
-        "version": 2,
+        "version": VERSION,
         "options": options,
         "plans": {"train": {"0": {"steps": 5}}},
         "keys": keys,

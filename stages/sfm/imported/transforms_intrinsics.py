@@ -18,7 +18,7 @@ MAX_LETTERS = 40  # of a value, in an error
 FISHEYE, PRISM, RATIONAL, PANORAMA = "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "FULL_OPENCV", "EQUIRECTANGULAR"
 PERSPECTIVES = ("", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", RATIONAL)
 FISHEYES = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", FISHEYE, PRISM)
-OTHER_LENSES = ("ftheta_p0", "latlong")  # keys that declare them to instant-ngp
+OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")  # keys that declare them to instant-ngp
 NERFSTUDIOS = ("k1", "k2", "k3", "k4", "p1", "p2")  # distortion_params, in nerfstudio's order
 NO_PANORAMAS = "panoramas are not supported"
 # Keys that tell one thing together: a frame that has one of a group has the group, and the file's count no more.
@@ -177,7 +177,11 @@ def _focal_lengths(values: Mapping[str, Any], axis: str, size: float) -> dict[st
 
 
 def _finite(value: Any, name: str) -> float:
-    number = value if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+    """A number, or one as text: nerfstudio's converter for RealityCapture writes distortion so."""
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
     if not abs(number) <= sys.float_info.max:
         raise ValueError(f"its {name} is {repr(value)[:MAX_LETTERS]}, not a finite number")
     return float(number)

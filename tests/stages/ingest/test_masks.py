@@ -92,8 +92,9 @@ def test_masks_may_be_jpegs(tmp_path: Path) -> None:
     assert paired == {"a.jpg": tmp_path / "a.png"} and strays == [tmp_path / "a.jpg"]
 
 
-def test_white_is_ignored_in_masks_of_instant_ngp(tmp_path: Path) -> None:
-    mask = 255 - ignoring(10, 20)
+@pytest.mark.parametrize("white", [255, 100, 1])
+def test_white_is_ignored_in_masks_of_instant_ngp(tmp_path: Path, white: int) -> None:
+    mask = np.where(ignoring(10, 20) > 0, 0, white).astype(np.uint8)
     found = read_mask(saved(tmp_path, mask, "dynamic_mask_a.png"), WIDTH, HEIGHT, 1)
     np.testing.assert_array_equal(found.pixels, ignoring(10, 20))
 

@@ -12,6 +12,7 @@ import pytest
 from stages.contract import StageError
 from stages.ingest.auxiliary_files import pair_masks
 from stages.ingest.sources import Source, camera_files, find_source, is_gone, photos_beside
+from tests.refusals import refused
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -400,3 +401,32 @@ def test_real_sets(shared_data: Path, given: str, kind: str, count: int) -> None
     source = find_source(shared_data / given)
     assert (source.kind, len(source.files)) == (kind, count)
     assert all(file.is_file() for file in source.files)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["cameras.xml", "registration.csv", "a.xmp", "bundle.out", "scene.abc", "scene.blend", "sfm.sfm", "cameras.npz"],
+)
+def test_cameras_in_forms_that_are_not_read_are_refused(name: str, tmp_path: Path) -> None:
+    touch(tmp_path, "photos/a.jpg", name)
+    with refused("ingest.unknown-cameras", name):
+        find_source(tmp_path / "photos", tmp_path / name)
+
+
+@pytest.mark.parametrize("given", ["keyframes", "keyframes/images", "keyframes/corrected_images"])
+def test_a_polycam_folder_gives_its_photos_without_their_maps(given: str, tmp_path: Path) -> None:
+    kinds = {"images": "jpg", "corrected_images": "jpg", "cameras": "json", "corrected_cameras": "json"}
+    kinds |= {"depth": "png", "confidence": "png"}
+    touch(tmp_path, "mesh_info.json", *(f"keyframes/{kind}/{i}.{kinds[kind]}" for kind in kinds for i in (11, 22)))
+    source = find_source(tmp_path / given)
+    assert (source.kind, names(source)) == ("photos", ["11.jpg", "22.jpg"])
+    assert source.root.name == ("corrected_images" if "corrected" in given else "images")
+
+
+def test_cameras_of_polycam_are_not_read(tmp_path: Path) -> None:
+    cameras = touch(tmp_path, "images/11.jpg", "cameras/11.json") / "cameras"
+    (cameras / "11.json").write_text(json.dumps({"fx": 50.0, "t_00": 1.0}))
+    with refused("io.transforms-without-frames", "11.json"):
+        find_source(tmp_path, cameras / "11.json")
+    with refused("ingest.no-colmap-model", "cameras"):
+        find_source(tmp_path, cameras)

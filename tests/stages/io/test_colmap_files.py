@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from stages.contract import StageError
-from stages.io.colmap_files import CAMERA_MODELS, read_model_files
+from stages.io.colmap_files import CAMERA_MODELS, image_names, read_model_files
 from stages.sfm.colmap.models import read_model, world_from_camera
 from tests.fuzz.cameras import colmap_models
 from tests.refusals import refused
@@ -54,6 +54,34 @@ def written(folder: Path, kind: str = "txt") -> Path:
     for name, content in colmap_models()[kind].items():
         (folder / name).write_bytes(content)
     return folder
+
+
+def test_binary_files_go_before_text_where_both_are_whole(tmp_path: Path) -> None:
+    binary = read_model(written(tmp_path, "bin"))
+    (written(tmp_path) / "cameras.txt").write_text("1 PINHOLE 32 24 1 2 3 4\n")
+    assert read_model(tmp_path).cameras == binary.cameras
+    (tmp_path / "images.bin").unlink()
+    assert read_model(tmp_path).cameras[0].params == (1, 2, 3, 4)
+    assert image_names(tmp_path) == [image.file for image in binary.images]
+
+
+def test_text_of_programs_on_windows(tmp_path: Path) -> None:
+    """With its line ends, backslashes in names, colours as decimals and no line of keypoints."""
+    plain = read_model(written(tmp_path))
+    for name in ("cameras", "images", "points3D"):
+        path = tmp_path / f"{name}.txt"
+        lines = [line.split(" ") for line in path.read_text().splitlines() if line and line[0] != "#"]
+        if name == "images":
+            lines = [[*line[:9], f"set\\{line[9]}"] for line in lines[::2]]
+        elif name == "points3D":
+            lines = [[*line[:4], *(f"{value}.0" for value in line[4:7]), line[7]] for line in lines]
+        path.write_bytes(b"".join(" ".join(line).encode() + b"\r\n" for line in lines))
+    read = read_model(tmp_path)
+    assert read.cameras == plain.cameras and [i.file for i in read.images] == [f"set\\{i.file}" for i in plain.images]
+    for one, other in zip(read.images, plain.images, strict=True):
+        np.testing.assert_array_equal(one.sfm_from_camera, other.sfm_from_camera)
+    np.testing.assert_array_equal(read.xyz, plain.xyz)
+    np.testing.assert_array_equal(read.rgb, plain.rgb)
 
 
 @pytest.mark.parametrize("left_out", [[0, 1, 2], [1], [2]])

@@ -101,3 +101,10 @@ def test_a_file_without_frames_is_no_path_to_render(tmp_path: Path) -> None:
     (tmp_path / "path.json").write_text('{"frames": []}')
     with refused("io.transforms-empty"):
         read_transforms(tmp_path / "path.json")
+
+
+def test_a_camera_path_of_nerfstudio_is_no_transforms_file(tmp_path: Path) -> None:
+    frame = {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50, "aspect": 1.5}
+    (tmp_path / "camera_path.json").write_text(json.dumps({"camera_type": "perspective", "camera_path": [frame]}))
+    with refused("io.transforms-without-frames"):
+        read_transforms(tmp_path / "camera_path.json")

@@ -49,13 +49,22 @@ def test_a_row_too_few_is_refused(tmp_path: Path) -> None:
         read_poses(tmp_path / "poses_bounds.npy", PHOTOS, ROWS)
 
 
-@pytest.mark.parametrize("content", ["text", "shape", "pickle", "nan", "size"])
+@pytest.mark.parametrize("content", ["text", "shape", "pickle", "archive", "large", "cut", "nan", "size"])
 def test_what_is_no_such_file_is_refused(tmp_path: Path, content: str) -> None:
     path, rows = tmp_path / "poses_bounds.npy", rows_of(POSES)
     if content == "text":
         path.write_text("no array")
     elif content == "pickle":
         np.save(path, np.array([{}], dtype=object))
+    elif content == "archive":
+        with path.open("wb") as stream:
+            np.savez(stream, rows=rows)
+    elif content in ("large", "cut"):
+        np.save(path, rows)
+        count = "9999999999999999" if content == "large" else "4"
+        path.write_bytes(
+            path.read_bytes().replace(b"(3, 17), }" + b" " * (len(count) - 1), f"({count}, 17), }}".encode())
+        )
     else:
         rows[1, {"nan": 3, "size": 4}.get(content, 0)] = {"nan": np.nan, "size": 40.5}.get(content, 1.0)
         np.save(path, rows[:, :15] if content == "shape" else rows)

@@ -112,6 +112,7 @@ def test_axes_turn_from_opengl_to_opencv_and_centres_stay(read) -> None:
         ({"x_fov": 90.0, "fl_y": 31}, ("PINHOLE", (30, 31, 30, 20))),
         (LENS | {"camera_angle_x": 3.0}, ("PINHOLE", (50, 52, 31, 19))),
         (LENS | {"w": 2 * W, "h": 2 * H}, ("PINHOLE", (25, 26, 15.5, 9.5))),
+        (LENS | {"k1": "0.1", "k4": "0.0", "p2": "1e-2"}, ("OPENCV", (50, 52, 31, 19, 0.1, 0, 0, 0.01))),
     ],
 )
 def test_intrinsics(read, values: dict[str, Any], expected: tuple[str, tuple[float, ...]]) -> None:
@@ -207,7 +208,9 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"transform_matrix": _with(0, 0, 1e308)}, r"frame './1': it is no rotation: 1e\+308 is in it"),
         ({"transform_matrix": _with(0, 0, 10**400)}, r"frame './1': its transform_matrix is not a matrix of numbers"),
         ({"fl_x": math.nan}, r"camera of frame './1': its fl_x is nan, not a finite number"),
-        ({"cx": "31"}, r"camera of frame './1': its cx is '31', not a finite number"),
+        ({"cx": "31 px"}, r"camera of frame './1': its cx is '31 px', not a finite number"),
+        ({"cx": [31]}, r"camera of frame './1': its cx is \[31\], not a finite number"),
+        ({"k1": "nan"}, r"camera of frame './1': its k1 is 'nan', not a finite number"),
         ({"k1": True}, r"camera of frame './1': its k1 is True, not a finite number"),
         ({"w": 0, "h": 0}, r"camera of frame './1': its w and h are 0 and 0"),
         ({"w": 80, "h": 40}, r"camera of './1': it is for 80×40 pixels, the photo has 60×40"),
@@ -219,6 +222,8 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"camera_model": "RAD_TAN_THIN_PRISM_FISHEYE"}, r"its camera_model is 'RAD_TAN_THIN_PRISM_FISHEYE', which is"),
         ({"camera_model": ["OPENCV"]}, r"frame './1': its camera_model is \['OPENCV'\], which is none of"),
         ({"ftheta_p0": 0.0}, r"frame './1': it has ftheta_p0: lenses of that kind are not supported"),
+        ({"latlong": True}, r"frame './1': it has latlong: lenses of that kind are not supported"),
+        ({"equirectangular": True}, r"frame './1': it has equirectangular: lenses of that kind are not supported"),
         ({"distortion_params": [0.1, 0.2]}, r"frame './1': its distortion_params are not six numbers, k1, k2, k3, k4"),
         ({"distortion_params": [0.1, 0, 0, 0, 0, None]}, r"frame './1': its p2 is None, not a finite number"),
         ({"distortion_params": [0, 0, 0, 0.1, 0, 0]}, r"frame './1': it has a k4, and its camera_model is not FULL_"),
@@ -260,6 +265,57 @@ def test_the_scale_of_a_matrix_is_left_out_and_named(read, scale: float, frames:
         np.testing.assert_allclose(scaled.sfm_from_camera, image.sfm_from_camera, atol=1e-12)
     (note,) = known.notes
     assert f"{len(frames)} frames" in note and f"{scale:g}" in note
+
+
+OF_OTHERS = {
+    "nerfstudio": {
+        "applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]],
+        "applied_scale": 3.0,
+        "ply_file_path": "sparse_pc.ply",
+        "orientation_override": "none",
+        "fisheye_crop_radius": 20,
+    },
+    "instant-ngp": {"scale": 0.5, "offset": [0.1, 0.2, 0.3], "aabb_scale": 16, "aabb": [[0, 0, 0], [1, 1, 1]]},
+    "Blender": {"locations": [], "fix_premult": True},
+}
+OF_THEIR_FRAMES = {
+    "nerfstudio": {"colmap_im_id": 7, "depth_file_path": "depths/1.png", "mask_path": "masks/1.png"},
+    "instant-ngp": {"sharpness": 0.1, "depth_path": "1.png", "rolling_shutter": [0, 0, 0, 0]},
+    "Blender": {"rotation": 0.0125, "time": 0.5},
+}
+
+
+@pytest.mark.parametrize("program", OF_OTHERS)
+def test_poses_are_those_of_the_file_whatever_else_is_in_it(read, program: str) -> None:
+    known = read([frame(i, **OF_THEIR_FRAMES[program]) for i in range(3)], **LENS, **OF_OTHERS[program])
+    plain = read([frame(i) for i in range(3)], **LENS)
+    assert known.model.cameras == plain.model.cameras and known.notes == plain.notes == []
+    for one, other in zip(known.model.images, plain.model.images, strict=True):
+        np.testing.assert_array_equal(one.sfm_from_camera, other.sfm_from_camera)
+
+
+SIZE = {"w": W, "h": H}
+RADIAL = {"k1": 0.1, "k2": 0.02, "k3": 0.003, "k4": 0.0, "p1": 0.01, "p2": -0.01}
+BY_CONVERTERS = {  # what nerfstudio's write: the file's values, the frame's, the camera
+    "polycam": ({"orientation_override": "none"}, LENS | SIZE, ("PINHOLE", (50, 52, 31, 19))),
+    "metashape": (LENS | SIZE | RADIAL, {}, ("FULL_OPENCV", (50, 52, 31, 19, 0.1, 0.02, 0.01, -0.01, 0.003, 0, 0, 0))),
+    "realitycapture": (
+        SIZE | {"orientation_override": "none"},
+        LENS | {key: str(value) for key, value in RADIAL.items()},  # a table's fields, as text
+        ("FULL_OPENCV", (50, 52, 31, 19, 0.1, 0.02, 0.01, -0.01, 0.003, 0, 0, 0)),
+    ),
+}
+
+
+@pytest.mark.parametrize("program", BY_CONVERTERS)
+def test_files_of_nerfstudios_converters_are_read(read, program: str) -> None:
+    of_file, of_frame, expected = BY_CONVERTERS[program]
+    known = read([frame(i, **of_frame) for i in range(3)], camera_model="OPENCV", **of_file)
+    (camera,) = known.model.cameras
+    assert (camera.model, camera.width, camera.height) == (expected[0], W, H) and known.notes == []
+    assert camera.params == pytest.approx(expected[1])
+    for index, image in enumerate(known.model.images):
+        np.testing.assert_allclose(image.sfm_from_camera, matrix(index)[:3] * [1, -1, -1, 1], atol=1e-12)
 
 
 def test_a_matrix_may_be_a_flat_list_of_its_rows(read) -> None:
