@@ -17,7 +17,7 @@ from stages.io.files import read_json, write_json, write_tensors
 from stages.io.photos import Box, Photo, read_photos
 from stages.io.sparse_model import SparseModel
 from stages.io.transforms_export import transforms
-from stages.normalise.test_split import split_photos
+from stages.normalise.split import split_photos
 from stages.sfm.colmap.cameras import camera_rays
 from stages.sfm.colmap.models import read_model
 

@@ -13,7 +13,7 @@ from stages.contract import StageError
 from stages.io.files import read_json, read_scene, read_tensors
 from stages.io.photos import Box, Photo, read_photos, write_photos
 from stages.normalise.scene_frame import _within
-from stages.normalise.test_split import split_photos
+from stages.normalise.split import split_photos
 from tests.camera_layouts import ball, ring, seen_by
 from tests.refusals import refused
 
