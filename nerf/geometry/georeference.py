@@ -18,6 +18,8 @@ EARTH_AXES_M = (6_378_137.0, 6_356_752.314)  # WGS 84
 MIN_POSITIONS = 4  # three fix a similarity, the fourth tells whether it is right
 OUTLIER_FACTOR = 3.0  # times the median distance: positions so wrong are not averaged with the others
 MAX_TRIMMING_ROUNDS = 10
+MIN_WIDTH = 1e-6  # of the centres' coordinates: less across their line is what rounding leaves of them
+EXACT_M = 1e-9  # off by less no position is an outlier: where all are exact, rounding is
 MAX_ERROR = 1 / 3  # of how far apart the positions are: with more they have nothing to do with the photos
 ONE_LINE = "they were taken along one line, which leaves open how the scene is turned about it"
 
@@ -86,7 +88,7 @@ def georeference(
     if spread < GPS_ERROR_M:
         return f"their positions lie within {spread:.0f} m, and GPS errs by up to {GPS_ERROR_M:.0f} m"
     width = _across(centres)
-    if _across(enu) < GPS_ERROR_M / 2 or not width * np.sqrt(len(centres)) > 1e-6 * np.abs(centres).max():
+    if _across(enu) < GPS_ERROR_M / 2 or not width * np.sqrt(len(centres)) > MIN_WIDTH * np.abs(centres).max():
         return ONE_LINE
     fitted, kept = _robust(centres, enu)
     if fitted.scale * width < GPS_ERROR_M / 2:
@@ -110,7 +112,7 @@ def _robust(
     for _ in range(MAX_TRIMMING_ROUNDS):
         fitted = align(centres[kept], enu[kept])
         off = np.linalg.norm(fitted.points(centres) - enu, axis=1)
-        now = off <= max(OUTLIER_FACTOR * float(np.median(off)), 1e-9)
+        now = off <= max(OUTLIER_FACTOR * float(np.median(off)), EXACT_M)
         if (now == kept).all():
             break
         kept = now

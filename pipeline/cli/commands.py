@@ -1,8 +1,4 @@
-"""The command line: finds the command, runs it, turns every ending into words and an exit code.
-
-Exit codes: 0 done; 2 usage; 3 the workspace; 10 to 19 the stage that failed (pipeline/engine/stage_list.py); 130
-Ctrl-C; 143 SIGTERM; 1 a defect of this program.
-"""
+"""The command line: finds the command, runs it, turns every ending into words and an exit code."""
 
 import io
 import json
@@ -15,7 +11,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from pipeline.cli import arguments
+from pipeline.cli import arguments, exit_codes
 from pipeline.cli.display import Unread, choose_display, open_closed_streams
 from pipeline.cli.durations import seconds_from
 from pipeline.cli.more import with_more
@@ -39,8 +35,6 @@ from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace
 from stages.amounts import duration
 from stages.contract import StageError
-
-EXIT_DEFECT, EXIT_USAGE, EXIT_WORKSPACE, EXIT_INTERRUPT, EXIT_TERMINATED = 1, 2, 3, 130, 143
 
 REPORT_IT = "Finished stages are kept. Please report it with the output of the same command and --debug."
 
@@ -68,7 +62,7 @@ def run_command(words: Sequence[str]) -> int:
     """Run one command line and return its exit code; errors are said on the way."""
     if not words or words[0] in ("-h", "--help"):
         print(arguments.overview(list(stage_list.STAGES)))
-        return 0 if words else EXIT_USAGE
+        return 0 if words else exit_codes.USAGE
     if words[0] == "--version":
         print(machine.versions(("pipeline-nerf",))["pipeline-nerf"])
         return 0
@@ -78,22 +72,22 @@ def run_command(words: Sequence[str]) -> int:
         return _command(words[0])(words[1:])
     except UsageError as error:
         _say("pipeline.usage", str(error), "", "", as_json)
-        return EXIT_USAGE
+        return exit_codes.USAGE
     except StageFailed as failure:
         if debug:
             traceback.print_exc()
-        return stage_list.STAGES[failure.stage].EXIT_CODE
+        return exit_codes.of_stage(failure.stage)
     except StageError as error:
         if debug:
             traceback.print_exc()
         _say(error.code, error.what, error.why, error.hint, as_json)
-        return EXIT_WORKSPACE
+        return exit_codes.WORKSPACE
     except KeyboardInterrupt:
         _say("pipeline.interrupted", "stopped", "Ctrl-C", go_on(words), as_json)
-        return EXIT_INTERRUPT
+        return exit_codes.INTERRUPT
     except Terminated:
         _say("pipeline.terminated", "stopped", "SIGTERM", go_on(words), as_json)
-        return EXIT_TERMINATED
+        return exit_codes.TERMINATED
     except BrokenPipeError:
         raise
     except Exception as error:
@@ -101,7 +95,7 @@ def run_command(words: Sequence[str]) -> int:
             traceback.print_exc()
         what = f"a defect of this program, not of your photos: {type(error).__name__}: {error}"
         _say("pipeline.defect", what, "it should not happen", REPORT_IT, as_json)
-        return EXIT_DEFECT
+        return exit_codes.DEFECT
 
 
 def _say(code: str, what: str, why: str, hint: str, as_json: bool) -> None:
@@ -166,7 +160,7 @@ def command_run(words: Sequence[str]) -> int:
             settings = with_source(asked, given.photos, cameras)
         except StageError as error:
             display.failed(stage_list.SOURCE, error)
-            return stage_list.STAGES[stage_list.SOURCE].EXIT_CODE
+            return exit_codes.of_stage(stage_list.SOURCE)
         new_budget = None if given.more is not None else (budget, 0.0)
         return _run_stages(root, settings, stages, given.common, display, force, new_budget=new_budget)
 
@@ -327,7 +321,7 @@ def command_status(words: Sequence[str]) -> int:
     """``pipeline status WORKSPACE``."""
     given = arguments.parse(arguments.StatusArguments, "status", words)
     statuses = status.all_statuses(*_reader(given.workspace), given.verify)
-    code = EXIT_DEFECT if given.verify and any(s.state == "damaged" for s in statuses) else 0
+    code = exit_codes.DEFECT if given.verify and any(s.state == "damaged" for s in statuses) else 0
     if given.json:
         print(json.dumps([asdict(s) for s in statuses]))
         return code

@@ -82,11 +82,13 @@ class Runner:
     def forecast(self, stages: Sequence[str], again: Collection[str]) -> Forecast:
         """How long a run of ``stages`` takes, ``again`` those of them that may run though they have a result. Nothing
         where the photos or a file that a setting names cannot be read: the stage that reads it says so."""
-        photos = photos_of(self.options[SOURCE])
-        if photos is None:
-            return Forecast([], {})
         try:
             to_run = [name for name in stages if name in again or self.found(name) is None]
+            if all(declared(STAGES[name], "SUMMARY") for name in to_run):
+                return Forecast([], {})
+            photos = photos_of(self.options[SOURCE])
+            if photos is None:
+                return Forecast([], {})
 
             def facts(stage: str, key: str | None) -> Mapping[str, Any] | None:
                 if key is None:

@@ -20,7 +20,7 @@ from stages.io.transforms_files import HELD_OUT, TRAIN, photo_names, read_splits
 SourceKind = Literal["photos", "video", "transforms", "blender", "colmap", "llff"]
 
 FEW_NAMES = 2
-LLFF = ".npy"  # the ending of LLFF's file of cameras
+LLFF, LLFF_FILE = ".npy", "poses_bounds.npy"  # the ending of LLFF's file of cameras, and what it is called
 _HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
 
 
@@ -83,6 +83,7 @@ def _source(photos: Path, cameras: Path | None) -> Source:
     if photos.is_file():
         return _from_transforms("transforms", photos.parent, photos)
     root = photo_root(photos)
+    cameras = cameras and _llff_in(cameras)
     if cameras is not None and cameras.is_file() and cameras.suffix.lower() != LLFF:
         return _from_transforms("transforms", root, cameras)
     if cameras is None and (photos / TRAIN).is_file():
@@ -117,7 +118,7 @@ def unused_cameras(source: Source) -> Path | None:
         with suppress(StageError, OSError):
             if set(_from_transforms("transforms", source.root, file).files) & set(source.files):
                 return file
-    return next((file for place in places if (file := place / f"poses_bounds{LLFF}").is_file()), None)
+    return next((file for place in places if (file := place / LLFF_FILE).is_file()), None)
 
 
 def unused_masks(source: Source) -> Path | None:
@@ -304,6 +305,13 @@ def _cameras_in(folder: Path, photos: Sequence[str]) -> Path:
             f"Give one of them: --cameras {found[0]}",
         )  # fmt: skip
     return folder if found[0].name == TRAIN else found[0]
+
+
+def _llff_in(cameras: Path) -> Path:
+    """LLFF's file, where the cameras are a folder that holds no others; else the cameras as given."""
+    file = cameras / LLFF_FILE
+    others = (cameras / name for name in ("transforms.json", TRAIN))
+    return file if file.is_file() and not any(map(Path.is_file, others)) and not _colmap_models(cameras) else cameras
 
 
 def _colmap_models(folder: Path) -> list[Path]:

@@ -20,9 +20,10 @@ from stages.io.files import read_scene, read_tensors, write_png
 from stages.mesh.cleaning import Cleaned, boundary, clean
 from stages.mesh.files import WRITERS, Z_UP_TO_Y_UP, ColouredMesh
 from stages.mesh.iso_level import IsoLevel, check_range, choose_iso_level
+from stages.mesh.marching_cubes import extract_surface
 from stages.mesh.preview import preview
 from stages.mesh.resolution import CHUNK, grid_box, point_cost, points_per_edge, slab_factor
-from stages.mesh.surface import Surface, decimate, extract_surface, face_areas, vertex_normals
+from stages.mesh.surface import Surface, decimate, face_areas, vertex_normals
 from stages.mesh.visibility import ShadowMap, sample_rays, shadow_maps, vertex_visibility
 
 if TYPE_CHECKING:

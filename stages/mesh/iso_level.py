@@ -19,7 +19,7 @@ from nerf.fields.density_grid import DensityGrid, along, first_crossing, ray_dis
 from nerf.fields.interface import RadianceModel
 from nerf.geometry.rays import Rays, clip_to_box, points_on
 from stages.contract import StageError
-from stages.mesh.surface import smoothed_occupancy
+from stages.mesh.marching_cubes import smoothed_occupancy
 
 CLIP_VOXELS = 4.0
 MARGIN = 1e-5

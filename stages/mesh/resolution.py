@@ -18,7 +18,8 @@ from stages.contract import Inputs, Progress
 from stages.hardware.device import compute_device
 from stages.io.field_files import load_field
 from stages.io.files import read_json, read_scene, read_tensors
-from stages.mesh.surface import extract_surface, vertex_normals
+from stages.mesh.marching_cubes import extract_surface
+from stages.mesh.surface import vertex_normals
 
 CHUNK = 1 << 16  # points given to the field at a time
 

@@ -1,4 +1,4 @@
-"""Triangles: marching cubes, areas, normals, components, decimation, open borders, samples.
+"""Triangles: areas, normals, components, decimation, open borders, samples.
 
 ``vertices`` are (n, 3) float64, ``faces`` (m, 3) int32 indices, counter-clockwise seen from outside, that is from
 the side of lower density.
@@ -10,14 +10,6 @@ import numpy as np
 from fast_simplification import simplify
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from skimage.measure import marching_cubes
-
-from nerf.fields.density_grid import DensityGrid, occupancy, smoothed
-from stages.contract import StageError
-
-# Passes of nerf.fields.density_grid.smoothed: a Gaussian of one grid spacing. The field's finest cells are about as
-# small, and what differs between two of them is noise that a grid would pick at random (docs/experiments/mesh.md).
-SMOOTHING_PASSES = 2
 
 
 class Surface(NamedTuple):
@@ -25,31 +17,6 @@ class Surface(NamedTuple):
 
     vertices: np.ndarray
     faces: np.ndarray
-
-
-def smoothed_occupancy(grid: DensityGrid, iso_level: float) -> DensityGrid:
-    """The occupancy, 1/2 where the density is ``iso_level``, without what is finer than the grid."""
-    return smoothed(occupancy(grid, iso_level), SMOOTHING_PASSES)
-
-
-def extract_surface(grid: DensityGrid, iso_level: float) -> Surface:
-    """The surface at density ``iso_level`` (marching cubes, Lewiner et al. 2003); open where the box cuts it.
-
-    Raises StageError where no point is that dense, or all are. Smoothing leaves nothing of sheets one grid point thick
-    and of rods two grid points thick.
-    """
-    values = smoothed_occupancy(grid, iso_level).values.cpu().numpy()
-    if not values.min() < 0.5 < values.max():
-        raise StageError(
-            "mesh.too-thin",
-            f"no surface at density {iso_level:.3g}",
-            f"the smoothed occupancy runs from {values.min():.0%} to {values.max():.0%} and does not pass 50%: the "
-            "scene is too thin for the grid, or fills the box",
-            "Give a higher --mesh.resolution or another --mesh.iso-level.",
-        )
-    index, faces, _, _ = marching_cubes(values, 0.5, gradient_direction="ascent")
-    vertices = grid.low.cpu().double().numpy() + index * grid.spacing().cpu().double().numpy()
-    return Surface(vertices, faces.astype(np.int32))
 
 
 def face_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -58,7 +58,7 @@ def _load_cameras(given: Path, folder: Path) -> None:
 def _import_cameras(cameras: Path, photos: list, folder: Path) -> None:
     """The end of stage sfm with given cameras, and the scene frame of them: finite, whatever they were."""
     from nerf.geometry.normalisation import normalise
-    from stages.normalise import _reconstruction
+    from stages.normalise.scene_frame import _reconstruction
     from stages.sfm.colmap.models import read_model
     from stages.sfm.imported.conventions import AS_DECLARED
     from stages.sfm.imported.import_poses import write_imported_model

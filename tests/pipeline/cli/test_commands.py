@@ -211,7 +211,7 @@ def test_json_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert code == 10
     assert events[-1]["event"] == "error"
-    assert set(events[-1]) == {"event", "stage", "what", "why", "hint"}
+    assert set(events[-1]) == {"event", "stage", "code", "what", "why", "hint"}
 
 
 @pytest.mark.parametrize(
@@ -228,7 +228,7 @@ def test_errors_outside_of_stages_are_events_too(
     assert run_command([*words, "--json"]) == code
     captured = capsys.readouterr()
     (event,) = map(json.loads, captured.out.splitlines())
-    assert set(event) == {"event", "stage", "what", "why", "hint"}
+    assert set(event) == {"event", "stage", "code", "what", "why", "hint"}
     assert (event["event"], event["stage"]) == ("error", None)
     assert event["what"].startswith(what) and captured.err == ""
 
@@ -300,7 +300,7 @@ def test_what_lies_beside_known_cameras_changes_nothing(tmp_path: Path, capsys: 
     for name in ("itself", "again"):  # as many paths as there are ways through them
         (tmp_path / "cameras" / name).symlink_to(tmp_path / "cameras")
     words = ("--cameras", str(tmp_path / "cameras"), "--until", "ingest")
-    assert "cameras given" in run_on(tmp_path / "photos", capsys, *words)[1]
+    assert "poses imported" in run_on(tmp_path / "photos", capsys, *words)[1]
     (tmp_path / "cameras/notes.txt").write_text("of no matter")
     assert "nothing to do" in run_on(tmp_path / "photos", capsys, *words)[1]
     assert "one camera" in run_on(tmp_path / "photos", capsys, "--until", "ingest")[1]

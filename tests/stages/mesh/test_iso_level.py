@@ -8,7 +8,7 @@ from nerf.fields.density_grid import DensityGrid, sample_density_grid
 from nerf.geometry.rays import Rays
 from stages.contract import StageError
 from stages.mesh.iso_level import check_range, choose_iso_level
-from stages.mesh.surface import extract_surface
+from stages.mesh.marching_cubes import extract_surface
 
 CORNER = torch.full((3,), 0.9)
 NUM_RAYS = 256

@@ -12,6 +12,8 @@ from stages import normalise
 from stages.contract import StageError
 from stages.io.files import read_json, read_scene, read_tensors
 from stages.io.photos import Box, Photo, read_photos, write_photos
+from stages.normalise.scene_frame import _within
+from stages.normalise.split import split_photos
 from tests.camera_layouts import ball, ring, seen_by
 from tests.refusals import refused
 
@@ -66,7 +68,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             point=scene.point,
             xy=np.zeros((len(scene.view), 2)),
         )
-        monkeypatch.setattr("stages.sfm.colmap.models.read_model", lambda sparse: model)
+        monkeypatch.setattr("stages.normalise.scene_frame.read_model", lambda sparse: model)
         return folders
 
     return build
@@ -213,7 +215,7 @@ def rig(standpoints: int, views: int) -> list[str]:
 )
 def test_of_a_rig_not_the_same_view_is_held_out_each_time(names: list[str], held_out: list[int]) -> None:
     photos = [Photo(name, f"images/{i}.png", 400, 400, 0, None, None, False, 1.0) for i, name in enumerate(names)]
-    split = normalise._split(photos, 8, None)
+    split = split_photos(photos, 8, None)
     assert [i for i, part in enumerate(split) if part == "test"] == held_out
 
 
@@ -278,7 +280,7 @@ def test_photos_from_one_place_are_refused_with_a_hint(inputs, progress) -> None
 def test_the_bearings_within_a_box_are_those_of_the_pixels_it_touches() -> None:
     grid = np.stack(np.meshgrid(np.arange(8.0), np.arange(8.0)), axis=-1)
     rays = np.concatenate([grid, np.ones((8, 8, 1))], axis=-1)  # x is the column, y the row
-    found = normalise._within(rays, (0.5, 0.125, 0.76, 0.5))
+    found = _within(rays, (0.5, 0.125, 0.76, 0.5))
     assert set(found[:, 0]) == {4, 5, 6} and set(found[:, 1]) == {1, 2, 3}
-    assert len(normalise._within(rays, (0.51, 0.51, 0.52, 0.52))) == 1
-    np.testing.assert_array_equal(normalise._within(rays, None), rays.reshape(-1, 3))
+    assert len(_within(rays, (0.51, 0.51, 0.52, 0.52))) == 1
+    np.testing.assert_array_equal(_within(rays, None), rays.reshape(-1, 3))

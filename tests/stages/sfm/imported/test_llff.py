@@ -10,6 +10,7 @@ from stages.ingest.sources import find_source
 from stages.sfm.imported.llff import read_llff
 from stages.sfm.imported.pose_files import read_poses
 from tests.refusals import refused
+from tests.stages.ingest.test_sources import touch
 from tests.stages.sfm.imported.test_pose_files import H, W, photo
 
 POSES = ring_of_cameras(3)[:, :3]
@@ -41,6 +42,14 @@ def test_rows_belong_to_photos_in_order_of_their_names(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"x")
     source = find_source(tmp_path, tmp_path / "poses_bounds.npy")
     assert (source.kind, source.frames) == ("llff", {"0": "a10.jpg", "1": "a2.jpg", "2": "b.jpg"})
+
+
+def test_the_folder_of_the_file_may_be_given(tmp_path: Path) -> None:
+    touch(tmp_path, "images/a.jpg", "poses_bounds.npy")
+    source = find_source(tmp_path, tmp_path)
+    assert (source.kind, source.cameras) == ("llff", tmp_path / "poses_bounds.npy")
+    touch(tmp_path, "sparse/0/cameras.bin", "sparse/0/images.bin")
+    assert find_source(tmp_path, tmp_path).cameras == tmp_path / "sparse/0"
 
 
 def test_a_row_too_few_is_refused(tmp_path: Path) -> None:

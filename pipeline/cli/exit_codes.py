@@ -1,0 +1,11 @@
+"""How a command ends, as a number: 0 done; 1 a defect of this program; 2 usage; 3 the workspace; 10 to 19 the stage
+that failed, by what it declares; 130 Ctrl-C; 143 SIGTERM."""
+
+from pipeline.engine.stage_list import STAGES
+
+DEFECT, USAGE, WORKSPACE, INTERRUPT, TERMINATED = 1, 2, 3, 130, 143
+
+
+def of_stage(name: str) -> int:
+    """That this stage failed."""
+    return STAGES[name].EXIT_CODE

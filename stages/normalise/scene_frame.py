@@ -1,0 +1,238 @@
+"""From posed photos to the scene frame: region of interest, up vector, near and far, the split, the exports."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from nerf import REGION_HALF
+from nerf.geometry.normalisation import Normalisation, normalise
+from nerf.geometry.reconstruction import Reconstruction, angles, extent
+from nerf.geometry.scene import Camera, Scene, Split, View
+from nerf.geometry.up_vector import Witness, up_by_places
+from stages.contract import Inputs, Progress, StageError, StageResult
+from stages.io.files import read_json, write_json, write_tensors
+from stages.io.photos import Box, Photo, read_photos
+from stages.io.sparse_model import SparseModel
+from stages.io.transforms_export import transforms
+from stages.normalise.split import split_photos
+from stages.sfm.colmap.cameras import camera_rays
+from stages.sfm.colmap.models import read_model
+
+if TYPE_CHECKING:
+    from stages.normalise import Config
+
+MIN_TRAINING_VIEWS = 2
+MIN_VIEWS = 3  # one to hold out, two to train on
+FRUSTUM_SAMPLES = 32  # ray directions along each side of a photo
+OPAQUE_SAMPLES = 128  # likewise, where the edges of what is opaque are told
+FULL_TURN_DEG = 320.0  # no gap wider than the step of nine photos around
+
+
+def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
+    """The stage's work: read the sparse model, choose the scene frame, write the stage's files."""
+
+    model = read_model(inputs["sfm"] / "sparse")
+    _check(config, len(model.images))
+    by_file = {photo.file: photo for photo in read_photos(inputs["ingest"])}
+    posed = sorted(
+        ((by_file[f"images/{image.file}"], i) for i, image in enumerate(model.images)), key=lambda pair: pair[0].name
+    )
+    photos, order = [photo for photo, _ in posed], [i for _, i in posed]
+    has_alpha = _has_alpha(photos, progress, tracked=len(model.view) > 0)
+    registration = read_json(inputs["sfm"] / "registration.json")
+    official = registration["test_files"]
+    split = split_photos(photos, config.test_every, official)
+    # What is opaque in a test photo decides nothing.
+    boxes = [photo.opaque if part == "train" else None for photo, part in zip(photos, split, strict=True)]
+    sfm = _reconstruction(model, order, boxes if has_alpha else None)
+    try:
+        found = normalise(sfm, config.roi, _up_by_gps(registration["georeference"], sfm, photos))
+    except ValueError as error:
+        hint = "Take photos from different places, or give --normalise.roi."
+        raise StageError("normalise.no-scale", "the scene has no scale", str(error), hint) from error
+    if split.count("train") < MIN_TRAINING_VIEWS:
+        raise StageError(
+            "normalise.few-training-photos",
+            f"only {split.count('train')} of {len(split)} photos are left to train on",
+            "the others are held out as test photos",
+            f"Add training photos, or {'change the given split' if official else 'raise --normalise.test-every'}.",
+        )
+    if has_alpha and not found.bounded:
+        where = "what the photos' alpha leaves" if config.roi is None else "the region given"
+        progress.note(
+            f"{found.beyond_alpha:.1%} of what is tracked lies beyond {where}: the scene goes on there, and "
+            "transparent parts are ignored, as masked ones are"
+        )
+    scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split)
+    write_json(folder / "scene.json", scene.to_json())
+    write_tensors(folder / "points.safetensors", _points(model, sfm, found))
+    write_json(folder / "transforms.json", transforms(scene))
+    if (without := sum(view.mask is None for view in scene.views)) and any(photo.mask for photo in photos):
+        them = f"{without} of {len(scene.views)} photos have none"
+        progress.note(f"transforms.json names no masks: nerfstudio takes one for each photo or none, and {them}")
+    return StageResult(
+        outputs=("scene.json", "points.safetensors", "transforms.json"),
+        line=_line(found),
+        facts=_facts(scene, found, len(model.view)),
+    )
+
+
+def _check(config: "Config", views: int) -> None:
+    if views < MIN_VIEWS:
+        raise StageError(
+            "normalise.few-photos",
+            f"only {views} photo{'s' * (views != 1)} with a known camera",
+            f"a scene needs at least {MIN_VIEWS}: two to learn from and one to check against",
+            "Add photos that overlap with these.",
+        )
+    if config.roi and config.roi[3] <= 0:
+        raise StageError(
+            "normalise.roi-radius",
+            f"--normalise.roi has radius {config.roi[3]:g}",
+            "the fourth number is the region's half side and must be above 0",
+            "Give x y z radius in the frame of output/transforms.json.",
+        )
+
+
+def _has_alpha(photos: list[Photo], progress: Progress, tracked: bool) -> bool:
+    """Whether the photos may say what is background: most have transparent parts, and most of these show what is opaque
+    from one of its sides to the other, as one sees a thing. Outdoors without a sky one does not, nor in photos with
+    empty corners. Where nothing is tracked, which would tell, all alpha counts. Exceptions are said."""
+    transparent = sum(photo.has_alpha for photo in photos)
+    framing = sum(photo.has_alpha and _ends_within(photo.opaque) for photo in photos) if tracked else transparent
+    opaque = len(photos) - transparent
+    has_alpha = transparent > opaque and 2 * framing > transparent
+    if has_alpha and opaque:
+        progress.note(f"{opaque} of {len(photos)} photos have no transparent parts: taken as opaque everywhere")
+    elif transparent and not has_alpha:
+        why = "most photos have none" if transparent <= opaque else "what is opaque is seen whole in few"
+        progress.note(f"transparent parts of {transparent} of {len(photos)} photos are ignored like masked ones: {why}")
+    return has_alpha
+
+
+def _ends_within(opaque: Box | None) -> bool:
+    """Whether what is opaque, nothing at all too, ends within its photo on the left and right, or above and below."""
+    left, top, right, bottom = opaque or (1.0, 1.0, 0.0, 0.0)
+    return (left > 0 and right < 1) or (top > 0 and bottom < 1)
+
+
+def _reconstruction(model: SparseModel, order: list[int], boxes: Sequence[Box | None] | None) -> Reconstruction:
+    """The sparse model as plain geometry, its photos in ``order``. ``boxes`` hold what is opaque of each, None where
+    all of it may be; None without alpha."""
+
+    def rays(side: int) -> list[np.ndarray]:
+        of_cameras = [camera_rays(camera, side, side).astype(float) for camera in model.cameras]
+        return [of_cameras[model.images[i].camera] for i in order]
+
+    opaque = None
+    if boxes is not None:
+        parts = [_within(grid, box) for grid, box in zip(rays(OPAQUE_SAMPLES), boxes, strict=True)]
+        opaque = np.stack([extent(angles(part)) for part in parts])
+    return Reconstruction(
+        from_camera=np.stack([model.images[i].sfm_from_camera for i in order]),
+        ray_directions=np.stack([grid.reshape(-1, 3) for grid in rays(FRUSTUM_SAMPLES)]),
+        points=model.xyz,
+        view=np.argsort(order)[model.view],
+        point=model.point,
+        opaque=opaque,
+    )
+
+
+def _up_by_gps(georeference: dict[str, Any] | None, sfm: Reconstruction, photos: list[Photo]) -> Witness | None:
+    """Up by where GPS says that the photos were taken; None where it says nothing, or does not say how high."""
+
+    located = [photo.latitude is not None and photo.longitude is not None for photo in photos]
+    if georeference is None or any(photo.altitude_m is None for photo, has in zip(photos, located, strict=True) if has):
+        return None
+    return up_by_places(sfm.centres[located], np.array(georeference["enu_from_sfm"]), georeference["error_m"])
+
+
+def _within(rays: np.ndarray, box: Box | None) -> np.ndarray:
+    """Those of a photo's (side, side, 3) ray directions that go through a box, at least one along each side, (n, 3)."""
+    if box is None:
+        return rays.reshape(-1, 3)
+    side, (left, top, right, bottom) = len(rays), box
+    rows, columns = (slice(int(low * side), math.ceil(high * side)) for low, high in ((top, bottom), (left, right)))
+    return rays[rows, columns].reshape(-1, 3)
+
+
+def _scene(
+    sfm: Reconstruction,
+    photos: list[Photo],
+    camera_of: list[int],
+    cameras: Sequence[Camera],
+    found: Normalisation,
+    split: list[Split],
+) -> Scene:
+    """The scene, its views in order of name. Alpha that is no background is one more mask."""
+
+    views = tuple(
+        View(
+            name=photo.name,
+            file=photo.file,
+            camera=camera_of[i],
+            scene_from_camera=found.scene_from_sfm.pose(sfm.from_camera[i]),
+            near=float(found.near[i]),
+            far=float(found.far[i]),
+            split=split[i],
+            mask=photo.mask if found.bounded else photo.opaque_mask or photo.mask,
+        )
+        for i, photo in enumerate(photos)
+    )
+    return Scene(
+        cameras=tuple(cameras),
+        views=views,
+        scene_from_sfm=found.scene_from_sfm,
+        bounded=found.bounded,
+        has_alpha=found.bounded,
+        capture_type=found.capture_type,
+        up_known=found.up.known,
+    )
+
+
+def _points(model: SparseModel, sfm: Reconstruction, found: Normalisation) -> dict[str, np.ndarray]:
+    """points.safetensors, as docs/ARCHITECTURE.md lists it."""
+
+    return {
+        "xyz": found.scene_from_sfm.points(model.xyz).astype(np.float32),
+        "rgb": model.rgb.astype(np.uint8),
+        "error_px": model.error_px.astype(np.float32),
+        "view": sfm.view.astype(np.int32),
+        "point": sfm.point.astype(np.int32),
+        "xy": model.xy.astype(np.float32),
+    }
+
+
+def _line(found: Normalisation) -> str:
+    """What was decided, for the user."""
+    arc = 360 if found.arc_deg > FULL_TURN_DEG else round(found.arc_deg / 10) * 10
+    capture_type = {
+        "around": f"{arc}° around an object",
+        "inside": "inside a space, looking around",
+        "forward": "photos facing one way",
+    }[found.capture_type]
+    background = "transparent" if found.bounded else "unbounded"
+    up = f"up from {found.up.source}" if found.up.known else "no up: the cameras disagree"
+    return f"{capture_type}, background {background} · {up}"
+
+
+def _facts(scene: Scene, found: Normalisation, observations: int) -> dict[str, Any]:
+    """The decisions and the numbers behind them."""
+
+    return {
+        "capture_type": scene.capture_type,
+        "bounded": scene.bounded,
+        "has_alpha": scene.has_alpha,
+        "up": found.up.source,
+        "up_known": scene.up_known,
+        "arc_deg": round(found.arc_deg, 1),
+        "share_beyond_region": round(found.beyond, 4) if observations else None,
+        "region_half_sfm": REGION_HALF / scene.scene_from_sfm.scale,
+        "near": min(view.near for view in scene.views),
+        "far": max(view.far for view in scene.views),
+        "train": len(scene.of_split("train")),
+        "test": len(scene.of_split("test")),
+    }
