@@ -36,9 +36,23 @@ SCENE_FIELDS_RENDERING: dict[str, str] = {
     r"\bGUIDED_EVERY\b": "sparse depth supervision",
 }
 
-EFFECTS: dict[str, str] = {}
+EFFECTS: dict[str, str] = {
+    r"\b(PhotoRays|PhotoColours|AsGiven|AsRendered|photo_parts)\b": "ImageEffects",
+    r"\b(Exposures|RefinedPoses)\b": "ExposureModel, PoseRefinement",
+    r"neutral exposure": "reference exposure",
+}
 
-SFM_AND_INGEST: dict[str, str] = {}
+SFM_AND_INGEST: dict[str, str] = {
+    r"second.opinion": "global mapping",
+    r"\blooser\b": "relaxed ratio test",
+    r"\bequip\b|flaw_of": "intrinsics, degenerate",
+    r"row_breaks|\bis_torn\b": "capture sequence, is_fragmented",
+    r"sfm_child|sfm_process": "worker process",
+    r"\blikeness\b|\blook_alike\b(?!\()": "similarity",
+    r"\b(Effort|efforts)\b": "retry strategies",
+    r"\bTier\b|(?i:bearable)": "quality level",
+    r"found no place": "unregistered image",
+}
 
 TRAINING: dict[str, str] = {}
 
@@ -53,7 +67,11 @@ MESH_AND_TRADEOFF: dict[str, str] = {
     r"\btells? its density\b": "density query rate",
 }
 
-PIPELINE: dict[str, str] = {}
+PIPELINE: dict[str, str] = {
+    r"\b_?(MOST|LEAST|FEWEST|LARGEST|FARTHEST)_[A-Z]": "MAX_, MIN_",
+    r"\b(UNKEYED|LINKS|NEEDS)\b": "NOT_HASHED, PUBLISHED, INPUTS",
+    r"--like\b": "--match-exposure",
+}
 
 RETIRED = SCENE_FIELDS_RENDERING | EFFECTS | SFM_AND_INGEST | TRAINING | MESH_AND_TRADEOFF | PIPELINE
 

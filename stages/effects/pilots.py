@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from stages.contract import Inputs, Progress, StageError
 from stages.effects.decisions import Decisions, image_effects
 from stages.effects.effect_list import EFFECTS
-from stages.evaluate.image_metrics import FEWEST_FOR_INTERVAL, mean_interval
+from stages.evaluate.image_metrics import MIN_FOR_INTERVAL, mean_interval
 from stages.train.config import BLACK
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from stages.train.config import Config as TrainConfig
 
 LONG_SIDE = 200  # pixels of the photos in a pilot
-MOST_KEPT = 4  # of the training photos, to judge by; with fewer than FEWEST_FOR_INTERVAL their own noise is not known
+MAX_KEPT = 4  # of the training photos, to judge by; with fewer than MIN_FOR_INTERVAL their own noise is not known
 SEEDS = 3
 BATCH_SAMPLES = 1 << 13  # half the usual: a pilot has to be short, and is judged early
 CHUNKS = 4  # fixed, so that a pilot ends the same whatever the machine
@@ -33,7 +33,7 @@ BESIDE_TRAINING = 0.3  # of the time of the trainings: reading photos, the warm-
 # Of a pilot's training, on one core, that take as long as fitting the pose of a photo kept back and drawing it again:
 # 7 in the scenes of tests/effect_scenes.py where alpha ends space, 20 to 26 where nothing does.
 STEPS_PER_FIT = 25
-LEAST_GAIN_DB = 0.1  # a gain must exceed its noise, and this, which nobody sees
+MIN_GAIN_DB = 0.1  # a gain must exceed its noise, and this, which nobody sees
 
 
 class Pilot(NamedTuple):
@@ -47,12 +47,12 @@ class Pilot(NamedTuple):
     @property
     def pays(self) -> bool:
         """Whether the gain is more than its noise."""
-        return self.gain_db > max(self.noise_db, LEAST_GAIN_DB)
+        return self.gain_db > max(self.noise_db, MIN_GAIN_DB)
 
     @property
     def hurts(self) -> bool:
         """Whether leaving it out would gain as clearly."""
-        return -self.gain_db > max(self.noise_db, LEAST_GAIN_DB)
+        return -self.gain_db > max(self.noise_db, MIN_GAIN_DB)
 
 
 class _Photo(NamedTuple):
@@ -78,7 +78,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     from stages.train.data import ALL_MASKED, PhotoReader, guided_dataset, view_mask, view_rays
     from stages.train.validation_images import set_aside
 
-    split = set_aside(scene, MOST_KEPT, FEWEST_FOR_INTERVAL)
+    split = set_aside(scene, MAX_KEPT, MIN_FOR_INTERVAL)
     if split is None:
         return "too few training photos"
     cameras = [scene.cameras[view.camera] for view in scene.views]
@@ -101,7 +101,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
         for view in split.of_split("validation")
     ]
     kept = tuple(photo for photo in photos if enough(photo.colours, photo.used))
-    if len(kept) < FEWEST_FOR_INTERVAL:
+    if len(kept) < MIN_FOR_INTERVAL:
         return f"too few training photos show enough at {size}"
     return PilotScene(split, dataset, kept)
 
@@ -123,7 +123,7 @@ def expected_seconds(scene: "Scene", steps: int) -> tuple[float, float]:
     per_step = seconds_per_step(_config(arm, steps, device), scene, arm, device)
     trainings = (1 + BESIDE_TRAINING) * 2 * SEEDS * steps * per_step
     on_cpu = per_step if device == "cpu" else seconds_per_step(_config(arm, steps, "cpu"), scene, arm, "cpu")
-    return trainings, trainings + 2 * SEEDS * MOST_KEPT * STEPS_PER_FIT * on_cpu * min(CHUNKS, cores())
+    return trainings, trainings + 2 * SEEDS * MAX_KEPT * STEPS_PER_FIT * on_cpu * min(CHUNKS, cores())
 
 
 def run_pilot(trial: PilotScene, off: Decisions, on: Decisions, steps: int, seed: int, progress: Progress) -> Pilot:

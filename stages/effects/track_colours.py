@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from nerf.geometry.scene import Scene, View
 
 MOST = 200_000  # observations: gains of 500 photos are then known to a few thousandths
-MOST_EXPECTED = 1000  # places per photo where a point should be seen and was not matched
-MOST_LOOKED_AT = 12_000_000  # observations of photos nearby that tell these places, for all photos: two seconds
+MAX_EXPECTED = 1000  # places per photo where a point should be seen and was not matched
+MAX_LOOKED_AT = 12_000_000  # observations of photos nearby that tell these places, for all photos: two seconds
 WINDOW = 1 / 200  # of the photo's longer side: what training at usual sizes makes one pixel or two of
-LEAST_WINDOW, LARGEST_WINDOW = 5, 3.0  # pixels; times the usual window
+MIN_WINDOW, MAX_WINDOW = 5, 3.0  # pixels; times the usual window
 # So many of a window's pixels whose brightest channel is beyond these are too many to trust its mean. A channel that is
 # dark beside another one is what lamps and the night look like; it hardly weighs (nerf/effects/statistics/tracks.py:
 # log_noise).
@@ -158,7 +158,7 @@ def _expected(
         near, pose = _seen_nearby(tracks, rank, centres, number), view.scene_from_camera
         arguments = tracks.towards[near], tracks.distance[near], tracks.point[near], pose[:, 3], xyz
         point = np.setdiff1d(expected_places(*arguments), tracks.point[tracks.view == number])
-        point = point[:: 1 + len(point) // MOST_EXPECTED]
+        point = point[:: 1 + len(point) // MAX_EXPECTED]
         camera = scene.cameras[view.camera]
         xy = project(camera, (xyz[point] - pose[:, 3]) @ pose[:, :3]).reshape(-1, 2) if len(point) else np.zeros((0, 2))
         inside = ((xy > 0) & (xy < _size(scene, view))).all(axis=1)  # NaN, behind the camera, is not inside
@@ -170,7 +170,7 @@ def _expected(
 
 def _seen_nearby(tracks: "TrackColours", rank: "np.ndarray", centres: "np.ndarray", number: int) -> "np.ndarray":
     """Which observations tell what training photo ``number`` should show: those of the photos near it, beside the
-    distance of what they observe. Where all photos' together would be more than MOST_LOOKED_AT, only those of every so
+    distance of what they observe. Where all photos' together would be more than MAX_LOOKED_AT, only those of every so
     many-th point, other points for each photo. ``rank`` numbers the observed points without gaps."""
     import numpy as np
 
@@ -179,7 +179,7 @@ def _seen_nearby(tracks: "TrackColours", rank: "np.ndarray", centres: "np.ndarra
     apart = np.linalg.norm(centres - centres[number], axis=1)
     apart[number] = np.inf
     near = np.flatnonzero(tracks.distance > apart[tracks.view] / NEAR_APART)
-    step = -(-len(near) * len(centres) // MOST_LOOKED_AT)
+    step = -(-len(near) * len(centres) // MAX_LOOKED_AT)
     return near[rank[near] % step == number % step] if step > 1 else near
 
 
@@ -200,10 +200,10 @@ def _windows(scene: "Scene", tracks: "TrackColours") -> "np.ndarray":
     if not len(tracks):
         return np.zeros(0, int)
     size = np.array([max(_size(scene, view)) for view in scene.of_split("train")])
-    usual = np.maximum(size * WINDOW, LEAST_WINDOW)[tracks.view]
+    usual = np.maximum(size * WINDOW, MIN_WINDOW)[tracks.view]
     extent = np.zeros(int(tracks.point.max()) + 1)
     np.maximum.at(extent, tracks.point, usual * tracks.footprint)
-    width = np.clip(extent[tracks.point] / tracks.footprint, usual, LARGEST_WINDOW * usual)
+    width = np.clip(extent[tracks.point] / tracks.footprint, usual, MAX_WINDOW * usual)
     return 2 * np.floor(width / 2).astype(int) + 1
 
 

@@ -22,7 +22,7 @@ from stages.contract import (
     StageResult,
     Workload,
 )
-from stages.evaluate.image_metrics import ERROR_SCALE, FEWEST_FOR_INTERVAL, error_map, mean_interval, ssim
+from stages.evaluate.image_metrics import ERROR_SCALE, MIN_FOR_INTERVAL, error_map, mean_interval, ssim
 from stages.io.files import read_json, read_scene, write_json, write_png
 from stages.io.photos import spread
 from stages.train import trained_seconds
@@ -51,7 +51,7 @@ RIGHT_HALVES = ("psnr_right", "psnr_fitted_right", "psnr_posed_right")
 FIGURES = ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view", *RIGHT_HALVES)
 TRUSTED_WIDTH = 0.5  # of the photos: below, a picture can be sharp and the field know nothing of fine detail
 WORTH_SAYING = 0.5  # dB between two scores of right halves
-LEAST_SIDE = 128  # pixels of the longer side of a photo that is scored, where there is a choice
+MIN_SIDE = 128  # pixels of the longer side of a photo that is scored, where there is a choice
 READING = 0.25  # seconds for each photo of the set where it is read at another size than the field was trained at
 BESIDE_DRAWING = 0.05  # seconds for each photo of the set, to read it: the mean image is one of them all
 DRAWINGS_TO_FIT = 3  # of a photo scored at a fitted pose: the raw one, one to fit by and the fitted one
@@ -135,7 +135,7 @@ def _affordable(config: Config, scene: "Scene", train: Path, may_shrink: bool, p
             f"{duration(sum(pixels) / speed)}, {allowance.words()}; --evaluate.photos asks for more"
         )
     downscale, one = config.downscale, pixels[chosen[0]]
-    smallest = max(cameras[chosen[0]].width, cameras[chosen[0]].height) / LEAST_SIDE
+    smallest = max(cameras[chosen[0]].width, cameras[chosen[0]].height) / MIN_SIDE
     saved = (one - budget) / speed - READING * len(scene.views)
     if may_shrink and saved > 0 and smallest > downscale:
         downscale = min(math.ceil(100 * downscale * math.sqrt(one / budget)) / 100, smallest)
@@ -342,7 +342,7 @@ def verdict(metrics: dict[str, Any]) -> str:
         what = f"Good, with fine detail missing: {figures}, {gain}"
     elif metrics["width_share"] < TRUSTED_WIDTH:
         what = f"Sharp as a small picture, finer detail was not looked at: {figures}, {gain}"
-    elif metrics["photos_scored"] < FEWEST_FOR_INTERVAL:
+    elif metrics["photos_scored"] < MIN_FOR_INTERVAL:
         what = f"Sharp, as far as {_photos(metrics['photos_scored'])} can tell: {figures}, {gain}"
     else:
         what = f"Sharp and trustworthy: {figures}, {gain}"
@@ -357,7 +357,7 @@ def _overall(images: list[dict[str, Any]], test_photos: int, downscale: float, n
         metrics[f"{key}_interval"] = mean_interval(values)
     if not images:
         notes = [*notes, f"{UNMEASURED[test_photos > 0]}, so nothing is measured"]
-    elif len(images) < FEWEST_FOR_INTERVAL:
+    elif len(images) < MIN_FOR_INTERVAL:
         notes = [*notes, f"no interval: {_photos(len(images))} cannot show how much the figures vary"]
     if small := sum(image["psnr_right"] is None for image in images):
         notes = [*notes, f"a half of {_photos(small)} has too few pixels to fit an exposure on or to score with it"]

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from nerf.fields.interface import Rendering
     from nerf.geometry.rays import Rays
 
-FEWEST_PIXELS = 64  # of a half
+MIN_PIXELS = 64  # of a half
 
 
 def right_half_psnr(
@@ -24,7 +24,7 @@ def right_half_psnr(
     """PSNR of the right half: as rendered, and with the exposure that makes the left half like the photo.
 
     ``rendering`` is (H, W), shown over ``background`` (3,), which no gain changes; ``truth`` is (H, W, 3), and only
-    pixels that are ``used``, (H, W) bool, count. (None, None) where a half has fewer than FEWEST_PIXELS of them.
+    pixels that are ``used``, (H, W) bool, count. (None, None) where a half has fewer than MIN_PIXELS of them.
     """
     from nerf.effects.exposure import expose
     from nerf.training.metrics import mean_squared_error, psnr
@@ -97,4 +97,4 @@ def halves(truth: "Tensor", used: "Tensor | None") -> "tuple[Tensor, Tensor]":
 
 def enough(truth: "Tensor", used: "Tensor | None") -> bool:
     """Whether both halves have the pixels that it takes."""
-    return min(int(half.sum()) for half in halves(truth, used)) >= FEWEST_PIXELS
+    return min(int(half.sum()) for half in halves(truth, used)) >= MIN_PIXELS

@@ -11,7 +11,7 @@ SSIM_WINDOW = 11
 ERROR_SCALE = 0.3
 """The error that error maps show brightest. Fixed, so that maps of different runs can be compared."""
 
-FEWEST_FOR_INTERVAL = 3  # of two it would be thirteen times as wide as they differ
+MIN_FOR_INTERVAL = 3  # of two it would be thirteen times as wide as they differ
 
 
 def ssim(image: "Tensor", truth: "Tensor", used: "Tensor | None" = None) -> float | None:
@@ -61,7 +61,7 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float] | None:
     from scipy.special import stdtrit
 
     count = len(values)
-    if count < FEWEST_FOR_INTERVAL:
+    if count < MIN_FOR_INTERVAL:
         return None
     mean = float(np.mean(values))
     half = float(stdtrit(count - 1, 0.975) * np.std(values, ddof=1) / count**0.5)

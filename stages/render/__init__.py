@@ -22,7 +22,7 @@ from stages.contract import (
 from stages.io.files import read_json, read_scene, write_json, write_png
 from stages.io.photos import spread
 from stages.render.path import CameraPath, PathKind, fitted_path, path_from_file, path_rays, usual_path
-from stages.render.plan import LEAST_WIDTH, even_width
+from stages.render.plan import MIN_WIDTH, even_width
 from stages.train import trained_seconds
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Config(StageConfig):
     )
     frames: int | None = Field(default=None, ge=2, description="none: as many as time allows, 24 to 120 if it can be")
     width: int | None = Field(
-        default=None, ge=LEAST_WIDTH, le=8192, description="pixels; odd numbers are rounded to even ones"
+        default=None, ge=MIN_WIDTH, le=8192, description="pixels; odd numbers are rounded to even ones"
     )
     fps: int | None = Field(default=None, ge=1, le=120, description="none: 30, fewer for fewer than 120 frames")
     seconds: float | None = Field(
@@ -156,7 +156,7 @@ def _why(
     path: CameraPath, frames: int, rays_per_second: float, allowance: "Allowance", asked: tuple[int | None, int | None]
 ) -> str:
     """What was chosen, how long it takes, and where that is less or more than one would wish."""
-    from stages.render.plan import FEWEST_FRAMES, SMALL_SIDE
+    from stages.render.plan import MIN_FRAMES, SMALL_SIDE
 
     camera = path.cameras[0]
     seconds = frames * camera.width * camera.height / rays_per_second
@@ -164,7 +164,7 @@ def _why(
     words += f"{duration(seconds)}, {allowance.words()}"
     if seconds > (allowance.given or allowance.trained):
         return f"{words}; that is longer, {'as asked' if any(asked) else 'but there is no smaller video'}"
-    small = (asked[0] is None and frames < FEWEST_FRAMES) or (
+    small = (asked[0] is None and frames < MIN_FRAMES) or (
         asked[1] is None and max(camera.width, camera.height) < SMALL_SIDE - 2
     )
     return f"{words}; more would take too long, --render.frames and --render.width ask for it" if small else words
@@ -215,13 +215,13 @@ def _check_memory(path: CameraPath) -> None:
 
 
 def _path(config: Config, scene: "Scene") -> CameraPath:
-    """The cameras to render; of a path whose length is still open, FEWEST_FRAMES."""
-    from stages.render.plan import FEWEST_FRAMES
+    """The cameras to render; of a path whose length is still open, MIN_FRAMES."""
+    from stages.render.plan import MIN_FRAMES
 
     if config.cameras is not None:
         return path_from_file(scene, config.cameras)
     assert config.path is not None
-    return fitted_path(scene, config.path, config.frames or FEWEST_FRAMES)
+    return fitted_path(scene, config.path, config.frames or MIN_FRAMES)
 
 
 def _render(path: CameraPath, scene: "Scene", painter: "Painter", progress: Progress) -> "Iterator[Rendering]":

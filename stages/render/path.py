@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from nerf.geometry.scene import Camera, Scene, Similarity
 
 PathKind = Literal["orbit", "spiral", "interpolated"]
-LARGEST_SIDE = 2**15  # pixels: four times as many as any screen has
-LEAST_FOCAL = 0.5  # in widths: a pinhole wider than 90 degrees stretches its corners
+MAX_SIDE = 2**15  # pixels: four times as many as any screen has
+MIN_FOCAL = 0.5  # in widths: a pinhole wider than 90 degrees stretches its corners
 ONE_PLACE = 1e-6  # scene units
 TRIED_FRAMES = 120  # of a path that may be unsuited
 ONE_LENS = 1.1  # between the longest and the shortest focal length of photos that are shown with one
@@ -131,7 +131,7 @@ def _pinhole(width: int, height: int, relative: float) -> "Camera":
     """With a focal length in longest sides, at most 90 degrees wide."""
     from nerf.geometry.scene import Camera
 
-    focal = max(float(relative) * max(width, height), LEAST_FOCAL * width)
+    focal = max(float(relative) * max(width, height), MIN_FOCAL * width)
     return Camera("PINHOLE", width, height, (focal, focal, width / 2, height / 2))
 
 
@@ -176,12 +176,12 @@ def path_from_file(scene: "Scene", file: Path) -> CameraPath:
             raise StageError(
                 "render.unusable-frame", f"cannot use frame {index} of {file.name}", str(error), hint
             ) from error
-    if (side := max(max(camera.width, camera.height) for camera in cameras)) > LARGEST_SIDE:
+    if (side := max(max(camera.width, camera.height) for camera in cameras)) > MAX_SIDE:
         raise StageError(
             "render.large-frames",
             f"cannot render the frames of {file.name}",
             f"one is {side} pixels long",
-            f"Give at most {LARGEST_SIDE}.",
+            f"Give at most {MAX_SIDE}.",
         )
     if len({(camera.width, camera.height) for camera in cameras}) > 1:
         raise StageError(

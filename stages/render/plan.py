@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from nerf.geometry.scene import Camera
 
-MOST_FRAMES, FEWEST_FRAMES, LEAST_FRAMES = 120, 24, 6  # four smooth seconds, a turn in steps of 15°, a slide show
-LARGEST_SIDE, USUAL_SIDE, SMALL_SIDE, LEAST_SIDE = 1920, 480, 200, 32  # pixels
-LEAST_WIDTH = 16  # pixels, whatever the height: of --render.width, too
+MAX_FRAMES, MIN_FRAMES, MIN_SLIDES = 120, 24, 6  # four smooth seconds, a turn in steps of 15°, a slide show
+MAX_SIDE, USUAL_SIDE, SMALL_SIDE, MIN_SIDE = 1920, 480, 200, 32  # pixels
+MIN_WIDTH = 16  # pixels, whatever the height: of --render.width, too
 FULL_RATE, USUAL_SECONDS = 30, 4.0
 
 
@@ -27,26 +27,26 @@ def affordable(rays: float, camera: "Camera", longest: float, frames: int | None
         return int(min(max(squares / side**2, least), most))
 
     if width is not None:
-        frames = frames or count(width * long_side / camera.width, LEAST_FRAMES, MOST_FRAMES)
+        frames = frames or count(width * long_side / camera.width, MIN_SLIDES, MAX_FRAMES)
         return frames, width
     if frames is None:
-        frames = count(min(USUAL_SIDE, longest), FEWEST_FRAMES, MOST_FRAMES)
+        frames = count(min(USUAL_SIDE, longest), MIN_FRAMES, MAX_FRAMES)
         if squares < frames * min(SMALL_SIDE, longest) ** 2:
-            frames = count(min(SMALL_SIDE, longest), LEAST_FRAMES, FEWEST_FRAMES)
-    side = min(max(math.sqrt(squares / frames), LEAST_SIDE), longest)
+            frames = count(min(SMALL_SIDE, longest), MIN_SLIDES, MIN_FRAMES)
+    side = min(max(math.sqrt(squares / frames), MIN_SIDE), longest)
     return frames, even_width(side * camera.width / long_side)
 
 
 def even_width(width: float) -> int:
-    """The largest even number of pixels that ``width`` has room for, LEAST_WIDTH at least."""
-    return max(LEAST_WIDTH, 2 * int(width / 2))
+    """The largest even number of pixels that ``width`` has room for, MIN_WIDTH at least."""
+    return max(MIN_WIDTH, 2 * int(width / 2))
 
 
 def longest_side(camera: "Camera", downscale: float) -> float:
     """The side beyond which a video shows nothing new: that of the photos as trained. Photos trained very small are
     drawn larger than that, for blocks of pixels would hide what the field knows; none larger than it is or 1920."""
     side = max(camera.width, camera.height)
-    return min(max(side / downscale, USUAL_SIDE), side, LARGEST_SIDE)
+    return min(max(side / downscale, USUAL_SIDE), side, MAX_SIDE)
 
 
 def chosen_fps(frames: int) -> int:

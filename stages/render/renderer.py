@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from nerf.geometry.rays import Rays
 
 SHARE = 0.3  # of the training's seconds that drawing may be expected to take; what is left is room for a busier machine
-LEAST_DRAWING = 0.5  # seconds: less draws nothing
+MIN_DRAWING = 0.5  # seconds: less draws nothing
 TIMED_SECONDS = 0.5
 TIMED_SHARE = 0.05  # of the training's seconds, where that is less
 FIRST_SIDE = 24  # pixels
@@ -91,7 +91,7 @@ class Allowance:
         """Seconds that pictures may take."""
         if self.given is None:
             return SHARE * self.trained
-        return max(LEAST_DRAWING, self.given - (time.perf_counter() - self.began) - self.beside)
+        return max(MIN_DRAWING, self.given - (time.perf_counter() - self.began) - self.beside)
 
     def words(self) -> str:
         """What the choice is held against."""

@@ -36,18 +36,18 @@ from stages.train.profile import observed
 from stages.train.state import Pace, Probes, RunState, TrainingBudget, TrainingLog, checkpoint_interval, lost_seconds
 from stages.train.validation_images import Target, load_metrics, look
 
-MOST_ROLLBACKS = 3
-MOST_RESTARTS = 2
+MAX_ROLLBACKS = 3
+MAX_RESTARTS = 2
 WARM_UP_STEPS = 500  # after these a field is examined; a healthy one beats a flat colour long before
 FIRST_MEASUREMENT = {"seconds": 2.0, "steps": 64.0}  # of training; the next follow at so many times that, and so on:
 MEASUREMENT_GROWTH, TARGET_GROWTH = 2**0.5, 1.1  # the second where a measurement may end the run
-MOST_MEASURING = 0.05  # of a run in seconds: the share of the time that may go into measuring
+MAX_MEASURING = 0.05  # of a run in seconds: the share of the time that may go into measuring
 # By how much PSNR may be expected to rise while the rate falls (0.9 dB is the mean of 33 short runs): so far below a
 # target a run anneals.
 ANNEALING_DB = 1.0
 PLAN_SHARE = 0.01  # of a budget in seconds: how often the clock is looked at, and how far off a plan may be
 PROVISIONAL_STEPS = 1_000_000  # the plan of a run in seconds until its first step has been timed
-MOST_LOST = 0.5  # of a run in seconds: however often it is killed, it has the other half to come to something
+MAX_LOST = 0.5  # of a run in seconds: however often it is killed, it has the other half to come to something
 
 
 class TrainingRun:
@@ -145,7 +145,7 @@ class TrainingRun:
         if steps is not None:
             return self.state.steps_before + steps, None
         assert seconds is not None, "one of the two is given"
-        return None, self.state.seconds_before + seconds - min(self.lost, MOST_LOST * seconds)
+        return None, self.state.seconds_before + seconds - min(self.lost, MAX_LOST * seconds)
 
     def _fits(self, checkpoint: Checkpoint) -> None:
         """Raise RuntimeError for the state of another field, TypeError for facts that are not a run's."""
@@ -249,7 +249,7 @@ class TrainingRun:
         kind = "seconds" if self.budget.steps is None else "steps"
         self.next_measurement = next_in_series(self._elapsed, FIRST_MEASUREMENT[kind], growth)
         if kind == "seconds":
-            self.next_measurement = max(self.next_measurement, self._elapsed + cost / MOST_MEASURING)
+            self.next_measurement = max(self.next_measurement, self._elapsed + cost / MAX_MEASURING)
 
     def _steer(self, target: Target) -> None:
         """Stop where the validation photos are as good as wanted; anneal where that may be all it takes; go on as
@@ -322,8 +322,8 @@ class TrainingRun:
         """Keep the batch, return to the last good checkpoint and halve the rate; give up by name after the third."""
         hint = self._on_record(fault)
         rollbacks = self.state.rollbacks + 1
-        if rollbacks > MOST_ROLLBACKS:
-            why = f"{fault}, after {MOST_ROLLBACKS} roll-backs that each halved the learning rate"
+        if rollbacks > MAX_ROLLBACKS:
+            why = f"{fault}, after {MAX_ROLLBACKS} roll-backs that each halved the learning rate"
             raise StageError("train.diverged", "training diverged", why, hint)
         checkpoint = latest_checkpoint(self.checkpoints, self.progress.note, self._load_sound)
         if checkpoint is None and self.budget.after is not None:
@@ -362,7 +362,7 @@ class TrainingRun:
         """Begin anew with another seed; give up by name after the second."""
         self.log.event("dead", self.state.step, symptom=symptom)
         restarts = self.state.restarts + 1
-        if restarts > MOST_RESTARTS:
+        if restarts > MAX_RESTARTS:
             why = f"after {WARM_UP_STEPS} steps {symptom}, with {restarts} different seeds"
             hint = "Check the cameras: the photos may not fit their poses. Or try a tenth of --train.learning-rate."
             raise StageError("train.collapsed", "the field does not learn", why, hint)

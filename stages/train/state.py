@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 RATE_MEMORY_SECONDS = 5.0  # how far back the measured speed and the shown PSNR look
 # Between checkpoints: at most this. Of a run in seconds a twentieth of them, if saving takes no more than a hundredth.
-CHECKPOINT_SECONDS, CHECKPOINT_SHARE, MOST_SAVING = 30.0, 0.05, 0.01
-MOST_OF_A_STALL = 3.0  # of the pace: as much of a longer step counts. A machine that sleeps for seconds is not slower
+CHECKPOINT_SECONDS, CHECKPOINT_SHARE, MAX_SAVING = 30.0, 0.05, 0.01
+MAX_OF_A_STALL = 3.0  # of the pace: as much of a longer step counts. A machine that sleeps for seconds is not slower
 
 
 class TrainingBudget(NamedTuple):
@@ -69,7 +69,7 @@ class RunState:
 def checkpoint_interval(budget: TrainingBudget, cost: float) -> float:
     """Seconds until the next checkpoint, where nobody says; the last one took ``cost`` seconds."""
     wanted = CHECKPOINT_SECONDS if budget.seconds is None else CHECKPOINT_SHARE * budget.seconds
-    return min(CHECKPOINT_SECONDS, max(wanted, cost / MOST_SAVING))
+    return min(CHECKPOINT_SECONDS, max(wanted, cost / MAX_SAVING))
 
 
 def lost_seconds(spent: Path, state: RunState) -> float:
@@ -94,7 +94,7 @@ class Pace:
         """Take one step into account."""
         self.count += 1
         if self.count > 2:
-            seconds = min(seconds, MOST_OF_A_STALL * self.seconds_per_step)
+            seconds = min(seconds, MAX_OF_A_STALL * self.seconds_per_step)
         new = max(1 / max(1, self.count - 1), 1 - math.exp(-seconds / RATE_MEMORY_SECONDS))
         self.seconds_per_step += new * (seconds - self.seconds_per_step)
         self.rays_per_step += new * (rays - self.rays_per_step)

@@ -23,8 +23,8 @@ PROBE_SEED = 0  # whatever the training's: curves of different seeds differ by w
 # take twice the rays of the probe.
 PATCHES, PATCH_SIDE = 16, 16
 VALIDATION_EVERY = 8  # of the training photos one is set aside to decide by,
-FEWEST_LEFT = 4  # and with fewer left to train on none can be
-MOST_VALIDATION = 8  # where a target decides when to stop
+MIN_LEFT = 4  # and with fewer left to train on none can be
+MAX_VALIDATION = 8  # where a target decides when to stop
 
 
 class Unseen(NamedTuple):
@@ -88,11 +88,11 @@ def look(trainer: FieldTrainer, unseen: Unseen) -> Look:
 
 
 def with_validation(scene: Scene) -> Scene:
-    """``scene`` with every eighth training photo, at most MOST_VALIDATION, evenly spread, in the split "validation".
+    """``scene`` with every eighth training photo, at most MAX_VALIDATION, evenly spread, in the split "validation".
 
     Raises StageError where too few would be left to train on.
     """
-    split = set_aside(scene, MOST_VALIDATION)
+    split = set_aside(scene, MAX_VALIDATION)
     if split is None:
         count = len(scene.of_split("train"))
         why = f"photos to decide by have to be set aside, and of {count} training photos too few would be left"
@@ -106,7 +106,7 @@ def set_aside(scene: Scene, most: int, least: int = 1) -> Scene | None:
     them."""
     train = scene.of_split("train")
     count = max(least, min(most, len(train) // VALIDATION_EVERY))
-    if len(train) - count < FEWEST_LEFT:
+    if len(train) - count < MIN_LEFT:
         return None
     chosen = {train[i].name for i in spread(len(train), count)}
     views = (replace(view, split="validation") if view.name in chosen else view for view in scene.views)

@@ -4,14 +4,31 @@ import random
 import shutil
 import signal
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from pipeline.engine.stage_list import STAGES
+from stages.sfm.retry_strategies import STRATEGIES
+from stages.sfm.worker_process import REFINING
 from tests.drills.drill import Prepare, Program, copy_workspace, results, run_words
 
-EXIT_CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
+# How a program that got a signal ends: its exit code, and the code of its last event.
+ENDS = {signal.SIGINT: (130, "pipeline.interrupted"), signal.SIGTERM: (143, "pipeline.terminated")}
+RELAXED = next(strategy for strategy in STRATEGIES if strategy.matches == "relaxed")
+# How the events of sfm tell where it is; two by a note, for the live line may miss what takes less than half a second.
+SFM_INSTANTS = {
+    "features": lambda event: event.get("done") is not None,
+    "matching": lambda event: event["event"] == "note" and event["message"].startswith("matching "),
+    RELAXED.name: lambda event: event["event"] == "note" and event["message"].endswith(f" yet: {RELAXED.description}"),
+    "final bundle adjustment": lambda event: event.get("done") == REFINING,
+}
+
+
+def reached(instant: str, events: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether stage sfm has got to one of the ``SFM_INSTANTS``."""
+    return any(event.get("stage") == "sfm" and SFM_INSTANTS[instant](event) for event in events)
 
 
 @dataclass
@@ -117,13 +134,13 @@ def interruptions(chain: Chain, stages: Sequence[str], count: int, seed: int, fo
 def unclean(program: Program, number: signal.Signals, workspace: Path) -> list[str]:
     """What is wrong with how a program that got a signal has ended."""
     faults = []
-    if program.wait() != EXIT_CODES[number]:
+    exit_code, code = ENDS[number]
+    if program.wait() != exit_code:
         faults.append(f"exit code {program.wait()}")
     if complaints := program.complaints:
         faults.append(f"it complained: {complaints}")
-    if (last := program.events()[-1]) | {"why": "", "hint": ""} != {
-        "event": "error", "stage": None, "what": "stopped", "why": "", "hint": ""
-    }:  # fmt: skip
+    words = {"what": "", "why": "", "hint": ""}
+    if (last := program.events()[-1]) | words != {"event": "error", "stage": None, "code": code, **words}:
         faults.append(f"its last words were {last}")
     if orphans := program.orphans():
         faults.append(f"left behind {orphans}")

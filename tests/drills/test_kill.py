@@ -13,11 +13,13 @@ import pytest
 from PIL import Image
 
 from pipeline.engine.stage_list import usual
-from tests.drills.campaigns import Chain
+from stages.sfm.worker_process import FIRST_STRATEGY, PHASES, REFINING
+from tests.drills.campaigns import RELAXED, SFM_INSTANTS, Chain, reached
 from tests.drills.drill import Program, copy_workspace, results
 from tests.synthetic_photos import SyntheticPhotos
 
 AT_WORK = ("train", "evaluate", "render", "mesh")  # stages that say how far they are: killed in the middle of it
+FEATURES_FOUND = FIRST_STRATEGY * sum(PHASES["features"])  # how far stage sfm is once every photo's features are kept
 
 
 def at_work(stage: str, events: list[dict[str, Any]]) -> bool:
@@ -72,10 +74,6 @@ def test_a_killed_video_goes_on_with_the_size_that_was_chosen_for_it(chain: Chai
     assert (len(path["frames"]), path["w"], path["fps"]) == (chosen["frames"], chosen["width"], chosen["fps"])
 
 
-# What is said when sfm reaches the instants to be killed at: finding features, matching, and matching once more.
-SFM_INSTANTS = ("features of", "match", "is not registered yet: matching them again", "final bundle adjustment")
-
-
 @pytest.fixture
 def photos_and_a_stranger(synthetic_photos: SyntheticPhotos, tmp_path: Path) -> Path:
     """Seven photos that overlap and one of something else, which only a second, less strict matching can look for."""
@@ -93,17 +91,16 @@ def test_killed_while_photos_are_matched(photos_and_a_stranger: Path, tmp_path: 
         words = ["run", str(photos_and_a_stranger), "-o", str(tmp_path / name), "--json", "--until", "sfm"]
         return Program([*words, "--sfm.max-features", "800"], tmp_path / "says")
 
-    def said(words: str, events: list[dict[str, Any]]) -> bool:
-        return any(words in event.get("message", "") for event in events)
-
-    assert SFM_INSTANTS[2] in sfm("undisturbed.nerf").finish().said
-    instants = random.Random(3)
-    for words in SFM_INSTANTS:
+    assert reached(RELAXED.name, sfm("undisturbed.nerf").finish().events())
+    delays = random.Random(3)
+    for instant in SFM_INSTANTS:
         program = sfm("killed.nerf")
-        assert program.wait_until(partial(said, words)), f"no kill at: {words}"
-        program.process.join(instants.uniform(0.0, 0.1))
+        assert program.wait_until(partial(reached, instant)), f"no kill at: {instant}"
+        program.process.join(delays.uniform(0.0, 0.1))
         program.strike(signal.SIGKILL)
         assert program.wait() == -signal.SIGKILL
-    program = sfm("killed.nerf").finish()
-    assert "going on with the features of 8 photos" in program.said
+    events = sfm("killed.nerf").finish().events()
+    done = {event["done"] for event in events if event["event"] == "progress" and event["stage"] == "sfm"}
+    assert done <= {None, FEATURES_FOUND, REFINING}, "only the final bundle adjustment was left to do"
+    assert not reached("matching", events) and not reached(RELAXED.name, events)
     assert results(tmp_path / "killed.nerf") == results(tmp_path / "undisturbed.nerf")

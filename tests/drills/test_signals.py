@@ -2,11 +2,12 @@
 
 import os
 import signal
+from functools import partial
 from pathlib import Path
 
 import pytest
 
-from tests.drills.campaigns import Chain, kills, unclean
+from tests.drills.campaigns import Chain, kills, reached, unclean
 from tests.drills.drill import Program
 from tests.synthetic_photos import SyntheticPhotos
 
@@ -40,17 +41,16 @@ def test_two_of_them_are_not_worse_than_one(chain: Chain, tmp_path: Path):
     assert unclean(program, signal.SIGINT, tmp_path / "w.nerf") == []
 
 
-# What is said when COLMAP is at work on each of its steps.
 @pytest.mark.parametrize(
-    "words, number",
-    [("features of", signal.SIGINT), ("match", signal.SIGKILL), ("adjusting all", signal.SIGTERM)],
+    "instant, number",
+    [("features", signal.SIGINT), ("matching", signal.SIGKILL), ("final bundle adjustment", signal.SIGTERM)],
 )
 def test_colmap_ends_with_the_program(
-    synthetic_photos: SyntheticPhotos, tmp_path: Path, words: str, number: signal.Signals
+    synthetic_photos: SyntheticPhotos, tmp_path: Path, instant: str, number: signal.Signals
 ):
     command = f"run {synthetic_photos.folder} -o {tmp_path / 'w.nerf'} --json --until sfm --sfm.max-features 500"
     program = Program(command.split(), tmp_path / "says")
-    assert program.wait_until(lambda events: any(words in event.get("message", "") for event in events))
+    assert program.wait_until(partial(reached, instant))
     assert program.strike(number) < PATIENT
     assert program.orphans() == []
     if number != signal.SIGKILL:

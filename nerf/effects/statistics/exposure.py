@@ -28,9 +28,9 @@ EV = float(np.log(2.0))
 # 0.05 EV. Called for from twice that, when gains deviate by 0.1 EV.
 THRESHOLD_EV = 2 * HARM / VALUE_PER_LOG_LIGHT / EV
 REDESCENDING = 5.0  # in robust deviations: as HUBER loses some 5 % to plain means of normal noise
-HUBER_ROUNDS, MOST_ROUNDS = 8, 30
+HUBER_ROUNDS, MAX_ROUNDS = 8, 30
 CONVERGED = 1e-5  # of a log gain: a tenth of what gains are rounded to where they leave
-LEAST_NOISE = 0.25 / 255  # of an sRGB value: no photo of 8 bits is more exact, and a perfect fit has no deviation
+MIN_NOISE = 0.25 / 255  # of an sRGB value: no photo of 8 bits is more exact, and a perfect fit has no deviation
 
 
 class ExposureFit(NamedTuple):
@@ -107,11 +107,11 @@ def _robust_weights(
     """
     base = sigma**-2
     weight, scale, size, before = base, 0.0, np.zeros_like(y), np.zeros(layout.views)
-    for turn in range(MOST_ROUNDS):
+    for turn in range(MAX_ROUNDS):
         gain = layout.parts(y, weight)
         rest = layout.around_points(y - gain[layout.view], weight)
         size = np.abs(rest) / (sigma * np.sqrt(np.maximum(1 - layout.share(weight), 0.02)))
-        scale = max(OF_GAUSSIAN * float(np.median(size)), LEAST_NOISE)
+        scale = max(OF_GAUSSIAN * float(np.median(size)), MIN_NOISE)
         size = size / scale
         if turn < HUBER_ROUNDS:
             weight = base * np.minimum(1, HUBER / np.maximum(size, HUBER))

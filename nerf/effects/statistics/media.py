@@ -13,7 +13,7 @@ from nerf.rendering.srgb import linear_light
 # largest and the least channel falls as exp(-b d). Over their mean it does too, for colours about as bright as A, and
 # exposure and shading fall out. A fifth of the colour lost between near and far photos is what anyone sees.
 THRESHOLD = 0.2
-LEAST_COLOUR = 0.08  # difference of channels as sRGB values, below which it is noise
+MIN_COLOUR = 0.08  # difference of channels as sRGB values, below which it is noise
 # Small spots fade in far photos that show them blurred, their colours most of all (JPEG keeps half of the resolution):
 # windows count by how even they are, half where their grey values deviate by this.
 ROUGH = 0.02
@@ -24,7 +24,7 @@ def media_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence:
     logarithm of saturation over distance within photos and points alike. Where nothing is known, that is no reason
     to expect fog."""
     colour = tracks.colour[fit.used]
-    strong = np.ptp(colour, axis=1) > LEAST_COLOUR
+    strong = np.ptp(colour, axis=1) > MIN_COLOUR
     if not strong.any():
         return unknown("", THRESHOLD, "no colourful points", False)
     # a point counts where it is strong in all its photos, or fading would leave out its own faintest cases

@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from nerf.effects.statistics.poses import PX, THRESHOLD_PX
 from nerf.effects.statistics.statistic import OF_GAUSSIAN, Evidence, judged, unknown
 
-LEAST_MOTION_PX = 2.0  # per frame, at 1000 pixels, below which rows have no time to differ
+MIN_MOTION_PX = 2.0  # per frame, at 1000 pixels, below which rows have no time to differ
 
 
 def rolling_shutter_evidence(
@@ -26,7 +26,7 @@ def rolling_shutter_evidence(
     a bundle adjustment, and what is found is a lower bound.
     """
     speed = np.linalg.norm(motion, axis=1)
-    moving = np.isfinite(speed) & (speed > LEAST_MOTION_PX)
+    moving = np.isfinite(speed) & (speed > MIN_MOTION_PX)
     kept = moving[view]
     if np.count_nonzero(kept) < 100 or np.count_nonzero(moving) < 3:
         return unknown(PX, THRESHOLD_PX, "no video, or one that hardly moves", False)

@@ -4,7 +4,7 @@ import numpy as np
 
 from nerf.effects.statistics.additive_model import two_way
 from nerf.effects.statistics.statistic import Evidence, judged, unknown
-from nerf.effects.statistics.tracks import MOST_IN_TRACK, TrackColours, within_groups
+from nerf.effects.statistics.tracks import MAX_IN_TRACK, TrackColours, within_groups
 
 # A sample that stands for a pixel is right at one size. Detail between one octave and the next is what photos at twice
 # the distance cannot show and photos at the other show whole: from there on they contradict each other at edges (the
@@ -40,7 +40,7 @@ def _between_photos(tracks: TrackColours) -> float:
     """The ratio of the sizes of pixels between nine tenths of the connected photos."""
     seen = tracks.only(np.lexsort((tracks.view, tracks.point)))
     rank, length = within_groups(seen.point)
-    seen = seen.only((length > 1) & (rank < MOST_IN_TRACK))
+    seen = seen.only((length > 1) & (rank < MAX_IN_TRACK))
     layout = two_way(seen.view, seen.point, seen.views)
     if not layout.main.any():
         return 1.0

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from nerf.rendering.srgb import KNEE, OFFSET, POWER, linear_light
 
-MOST_IN_TRACK = 64  # observations of one point that enter a fit: their number of pairs is what a fit costs
+MAX_IN_TRACK = 64  # observations of one point that enter a fit: their number of pairs is what a fit costs
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,13 @@ class TrackColours:
 
 def usable(tracks: TrackColours) -> Int[np.ndarray, "m"]:
     """The observations that fits use, in order of point, then view: unsaturated, of points that at least two photos
-    show unsaturated, of each point at most MOST_IN_TRACK, evenly drawn."""
+    show unsaturated, of each point at most MAX_IN_TRACK, evenly drawn."""
     kept = np.flatnonzero(~tracks.saturated)
     kept = kept[np.lexsort((tracks.view[kept], tracks.point[kept]))]
     rank, length = within_groups(tracks.point[kept])
-    # the first observation of each of MOST_IN_TRACK equal parts of a long track
-    part, before = rank * MOST_IN_TRACK // length, (rank - 1) * MOST_IN_TRACK // length
-    drawn = (length <= MOST_IN_TRACK) | (part != before)
+    # the first observation of each of MAX_IN_TRACK equal parts of a long track
+    part, before = rank * MAX_IN_TRACK // length, (rank - 1) * MAX_IN_TRACK // length
+    drawn = (length <= MAX_IN_TRACK) | (part != before)
     other_view = np.zeros(len(kept), bool)
     if len(kept):
         view, start = tracks.view[kept], np.flatnonzero(rank == 0)

@@ -16,9 +16,9 @@ from nerf.effects.statistics.tracks import TrackColours
 from nerf.rendering.srgb import linear_light, srgb_values
 
 OUTLIER = 0.1  # sRGB value, rms of the channels: ten times what a good photo is off by
-FEWEST_POINTS = 20  # in a photo, for a share of them to mean something
+MIN_POINTS = 20  # in a photo, for a share of them to mean something
 SURE = 5.0  # robust deviations over what the other photos have
-LEAST_EXCESS = 0.05  # of a photo's points: less is an edge that is missed by a pixel
+MIN_EXCESS = 0.05  # of a photo's points: less is an edge that is missed by a pixel
 # A share q of all pixels showing something else, by some 0.3, adds 0.09 q to the squared error where the field has it
 # right, and as much again where it is led astray: 0.15 % of them would be 1.1 dB. Points are no pixels, and
 # surfaces that hide each other are expected wrongly: one percent of all points is beyond doubt.
@@ -47,7 +47,7 @@ def odd_photos(tracks: TrackColours, fit: ExposureFit, expected: TrackColours | 
     looked = looked.only(known)
     outlier = _differs(looked, _usual_light(tracks, fit), fit)
     points = np.bincount(looked.view, minlength=looked.views)
-    seen, none = points >= FEWEST_POINTS, np.zeros(looked.views)
+    seen, none = points >= MIN_POINTS, np.zeros(looked.views)
     if np.count_nonzero(seen) < 3:
         return Odd(none, none, none > 0, none > 0)
     points = np.where(seen, points, 1)
@@ -56,7 +56,7 @@ def odd_photos(tracks: TrackColours, fit: ExposureFit, expected: TrackColours | 
     deviation = OF_GAUSSIAN * float(np.median(np.abs(share - usual)[seen]))
     count_noise = np.sqrt(np.maximum(usual * (1 - usual), 1 / points) / points)
     beyond, variance = np.where(seen, share - usual, 0.0), np.where(seen, deviation**2 + count_noise**2, 0.0)
-    return Odd(beyond, variance, (beyond > SURE * np.sqrt(variance)) & (beyond > LEAST_EXCESS), seen)
+    return Odd(beyond, variance, (beyond > SURE * np.sqrt(variance)) & (beyond > MIN_EXCESS), seen)
 
 
 def transients_evidence(odd: Odd, fit: ExposureFit) -> Evidence:

@@ -17,8 +17,8 @@ from nerf.effects.statistics.tracks import TrackColours, log_light
 from nerf.rendering.srgb import OFFSET, POWER
 
 THRESHOLD = 2 * HARM  # deviation of colours, sRGB values: a field of diffuse colours has it as its error
-FEWEST_PAIRS = 60  # in each of the two ranges of angles
-LEAST_SPREAD_DEG = 1.5  # between the two ranges
+MIN_PAIRS = 60  # in each of the two ranges of angles
+MIN_SPREAD_DEG = 1.5  # between the two ranges
 LARGEST = 20.0  # medians of squared differences (three deviations), what false matches and passers-by count at most
 BATCHES = 20
 
@@ -39,12 +39,12 @@ def view_dependence_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence
     cosine = np.clip(np.sum(towards[first] * towards[second], axis=1), -1, 1)
     angle = np.degrees(np.arccos(cosine))
     low, high = np.quantile(angle, [1 / 3, 2 / 3]) if len(angle) else (0.0, 0.0)
-    if len(angle) and high - low < LEAST_SPREAD_DEG:
+    if len(angle) and high - low < MIN_SPREAD_DEG:
         why = f"points are seen from directions {low:.1f}° to {high:.1f}° apart, too alike to compare"
         return unknown(unit, THRESHOLD, why, None)
     wide = angle >= high
     chosen = wide | (angle <= low)
-    if min(wide.sum(), (chosen & ~wide).sum()) < FEWEST_PAIRS:
+    if min(wide.sum(), (chosen & ~wide).sum()) < MIN_PAIRS:
         return unknown(unit, THRESHOLD, "too few points are seen from several directions", None)
     squared = _half_squares(tracks, fit, first, second)
     for group in (wide, chosen & ~wide):

@@ -134,7 +134,7 @@ def start_pairs(
 def second_look(
     pairs: Pairs, missing: Sequence[int], neighbours: int, similarity: Callable[[], SimilarityMatrix]
 ) -> Pairs:
-    """The pairs again, and more for photos that found no place: as many as were matched already, at most all.
+    """The pairs again, and more for unregistered photos: as many as were matched already, at most all.
 
     They go to each missing photo's most similar ones, and are at least twice as many as it had.
     """

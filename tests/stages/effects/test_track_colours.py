@@ -252,7 +252,7 @@ def test_only_photos_nearby_are_asked_what_should_be_seen(monkeypatch: pytest.Mo
     near = pairs()
     monkeypatch.setattr(transients, "NEAR_APART", 100.0)
     assert pairs() == near and len(near) > 1000
-    monkeypatch.setattr(stages.effects.track_colours, "MOST_LOOKED_AT", 300 * count)
+    monkeypatch.setattr(stages.effects.track_colours, "MAX_LOOKED_AT", 300 * count)
     some = pairs()
     # whole points are drawn, other ones for every photo
     assert some < near and 0.05 < len(some) / len(near) < 0.3

@@ -286,7 +286,7 @@ def test_photos_asked_for_are_scored_whatever_they_take(make: Make, tmp_path: Pa
 
 
 def test_a_photo_too_large_for_the_time_is_scored_smaller(make: Make, progress: Any, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(evaluate, "LEAST_SIDE", 4)
+    monkeypatch.setattr(evaluate, "MIN_SIDE", 4)
     monkeypatch.setattr("stages.render.renderer.Allowance.left", lambda _: 2.0)
     inputs = make(speed=WIDTH * HEIGHT // 32)  # a photo takes 32 seconds
 
@@ -296,7 +296,7 @@ def test_a_photo_too_large_for_the_time_is_scored_smaller(make: Make, progress: 
     assert downscale() == 4
     assert "it is scored at 25% of its width; --evaluate.downscale 1 asks for more" in progress.notes[-1]
     assert downscale(downscale=1) == 1, "as asked"
-    monkeypatch.setattr(evaluate, "LEAST_SIDE", WIDTH / 3)
+    monkeypatch.setattr(evaluate, "MIN_SIDE", WIDTH / 3)
     assert downscale() == 3, "no smaller than can be judged"
     monkeypatch.setattr(evaluate, "READING", 30 / 15 + 0.01)
     assert downscale() == 1, "reading fifteen photos at another size takes as long"

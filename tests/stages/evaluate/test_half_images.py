@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerf.effects.exposure import expose
 from nerf.fields.interface import Rendering
-from stages.evaluate.half_images import FEWEST_PIXELS, right_half_psnr, viewing_distance
+from stages.evaluate.half_images import MIN_PIXELS, right_half_psnr, viewing_distance
 
 BLACK = torch.zeros(3)
 
@@ -57,7 +57,7 @@ def test_a_half_with_too_few_pixels_is_not_scored(half: int):
     of_half[:] = False
     of_half.view(30, 20)[:8, :8] = True
     shown = shown[:, :40]
-    assert int(of_half.sum()) == FEWEST_PIXELS
+    assert int(of_half.sum()) == MIN_PIXELS
     assert None not in right_half_psnr(rendering(shown), BLACK, shown, used)
     of_half[0, 0] = False
     assert right_half_psnr(rendering(shown), BLACK, shown, used) == (None, None)

@@ -207,7 +207,7 @@ def rig(standpoints: int, views: int) -> list[str]:
         ([f"{day}_{i}.jpg" for day, count in (("a", 5), ("b", 12), ("c", 7)) for i in range(count)], [0, 8, 16]),
         (rig(7, 3), [0, 8, 16]),
         (rig(10, 8), [0, 9, 18, 27, 36, 45, 54, 63, 64, 73]),
-        (rig(10, 8)[:70] + rig(10, 8)[71:], [0, 9, 18, 27, 36, 45, 54, 63, 64, 73]),  # one found no place
+        (rig(10, 8)[:70] + rig(10, 8)[71:], [0, 9, 18, 27, 36, 45, 54, 63, 64, 73]),  # one is unregistered
         (rig(3, 16), [0, 9, 18, 27, 36, 45]),
         (rig(8, 4)[:30], [0, 9, 18, 27]),
         (rig(2, 8)[:9], [0, 8]),  # of the second standpoint one is left

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.effects.statistics.tracks import MOST_IN_TRACK, TrackColours, log_light, log_noise, usable
+from nerf.effects.statistics.tracks import MAX_IN_TRACK, TrackColours, log_light, log_noise, usable
 from tests.nerf.effects.statistics.photographed_points import photographed_points
 
 
@@ -31,7 +31,7 @@ def test_long_tracks_are_thinned_evenly() -> None:
     tracks = photographed_points(0, views=500, points=3, per_point=400)
     tracks.saturated[:] = False
     used = usable(tracks)
-    assert len(used) == 3 * MOST_IN_TRACK
+    assert len(used) == 3 * MAX_IN_TRACK
     view = np.sort(tracks.view[used][tracks.point[used] == 1])
     assert np.diff(np.searchsorted(np.sort(tracks.view[tracks.point == 1]), view)).max() <= 7
 
