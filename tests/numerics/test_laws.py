@@ -19,7 +19,8 @@ from nerf.kernels.torch.occupancy import binary_occupancy, cell_numbers
 from nerf.rendering.sampling import invert_cdf
 from nerf.rendering.volume_rendering import composite, volume_weights
 from stages.evaluate.image_metrics import ssim
-from stages.mesh.surface import extract_surface, is_watertight
+from stages.mesh.marching_cubes import extract_surface
+from stages.mesh.surface import is_watertight
 from tests.refusals import refused
 
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["torch", "warp"])
