@@ -12,15 +12,13 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
-from nerf.effects import ImageEffects
-from nerf.effects.exposure import ExposureModel
-from nerf.effects.pose_refinement import PoseRefinement
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.validation_probe import make_probe, measure
 from nerf.training.vanilla_trainer import VanillaTrainer
 from stages import train
 from stages.contract import StageError, StageResult
+from stages.effects.decisions import read_decisions, write_decisions
 from stages.ingest.decoding import DecodeError, decode
 from stages.io.field_files import load_field
 from stages.io.files import read_scene
@@ -165,12 +163,12 @@ def test_rays_that_are_no_numbers_end_training_by_name(
     assert (tmp_path / "train" / "nonfinite_5.safetensors").is_file()
 
 
-@pytest.mark.parametrize("what", ["poses", "gains"])
+@pytest.mark.parametrize("effect", ["pose_refinement", "exposure"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_per_image_parameters_are_gated_and_rolled_back(
-    kind: str, what: str, inputs: dict[str, Path], tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
+    kind: str, effect: str, inputs: dict[str, Path], tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with_effects(monkeypatch, what)
+    write_decisions(inputs["effects"], read_decisions(inputs["effects"]).having(effect))
     monkeypatch.setattr(loop, "WARM_UP_STEPS", 3 * WARM_UP)  # the rate is halved: at first it looks dead
 
     def poison(trainer: Any) -> None:
@@ -302,15 +300,3 @@ def spoil_once_at(step: int, spoil: Callable[[Any], None], monkeypatch: pytest.M
             spoil(trainer)
 
     spoil_at(step, first_time, monkeypatch, kind)
-
-
-def with_effects(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
-    """Train with poses or gains of photos, whatever the effects say."""
-
-    def effects(decisions: Any, views: Any, dataset: Any) -> ImageEffects:
-        centres = torch.tensor(np.stack([view.scene_from_camera[:, 3] for view in views]), dtype=torch.float32)
-        if what == "poses":
-            return ImageEffects((PoseRefinement(centres),))
-        return ImageEffects(colours=(ExposureModel(torch.zeros(len(views), 3)),))
-
-    monkeypatch.setattr("stages.effects.decisions.image_effects", effects)

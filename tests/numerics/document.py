@@ -9,6 +9,7 @@ DOCUMENT = Path(__file__).parents[2] / "docs" / "NUMERICS.md"
 
 # What has no row. A module of nerf/ stands in a row, here, or fails a test.
 ELSEWHERE = {
+    "nerf/kernels/__init__.py": "resolutions rounded, rows in whole numbers: tests/nerf/kernels/torch/test_encoding.py",
     "nerf/kernels/torch/hidden_layer.py": "max(x + y, 0) and its mask, bit for bit: "
     "tests/nerf/kernels/warp/test_warp.py; "
     "NaN stays NaN: tests/numerics/test_not_a_number.py",
@@ -44,6 +45,8 @@ ELSEWHERE = {
     "nerf/rendering/images.py": "cuts pictures into chunks: tests/nerf/rendering/test_images.py",
     "nerf/training/validation_probe.py": "mean colour, PSNR, patches of pixels: "
     "tests/nerf/training/test_validation_probe.py",
+    "nerf/training/trainer.py": "a pixel over its background, linear in alpha: "
+    "tests/nerf/training/test_vanilla_trainer.py",
     "nerf/training/vanilla_trainer.py": "sums of chunks; refuses what is not finite before the update: "
     "tests/nerf/training/test_vanilla_trainer.py",
     "nerf/training/hash_grid_trainer.py": "likewise: tests/nerf/training/test_hash_grid_trainer.py",
@@ -61,6 +64,8 @@ ELSEWHERE = {
     "nerf/geometry/up_vector.py": "float64: tests/nerf/geometry/test_up_vector.py",
     "nerf/geometry/near_far.py": "float64: tests/nerf/geometry/test_normalisation.py",
     "nerf/geometry/alignment.py": "float64, refuses points on one line: tests/nerf/geometry/test_alignment.py",
+    "nerf/geometry/georeference.py": "float64, in metres on WGS 84, positions far off the rest left out: "
+    "tests/nerf/geometry/test_georeference.py",
     "nerf/geometry/camera_paths.py": "float64: tests/nerf/geometry/test_camera_paths.py",
     "nerf/synthetic/shapes.py": "the synthetic scene, without gradient, against exact geometry: "
     "tests/nerf/synthetic/test_shapes.py",

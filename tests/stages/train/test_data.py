@@ -121,17 +121,15 @@ def test_cameras_of_test_views_do_not_enter_the_training_dataset(tmp_path: Path,
     assert torch.equal(dataset.patches, training_dataset(inputs["ingest"], scene, "train", 1.0, progress).patches)
 
 
-def test_evaluation_reads_the_pixels_that_training_stored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, progress: SilentProgress
-) -> None:
+def test_evaluation_reads_the_pixels_that_training_stored(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path)
     ingest, trained, unseen = inputs["ingest"], scene.of_split("train")[2], scene.of_split("test")[1]
     reader = PhotoReader(ingest, scene, 2.0)
     decoded = [reader.pixels(view, WHITE) for view in (trained, unseen)]
     for split in ("train", "test"):
         training_dataset(ingest, scene, split, 2.0, progress)
-    monkeypatch.setattr("stages.io.photos.load_pixels", None)
     for view, pixels in zip((trained, unseen), decoded, strict=True):
+        (ingest / view.file).unlink()
         assert torch.equal(reader.pixels(view, WHITE), pixels)
 
 
@@ -144,7 +142,7 @@ def test_where_photos_are_stored_is_found_out_once_for_each_split(
 
     inputs, scene = photographed(tmp_path)
     asked = list[str]()
-    monkeypatch.setattr("stages.io.pixel_store.pixel_store", found_out)
+    monkeypatch.setattr("stages.train.data.pixel_store", found_out)
     reader = PhotoReader(inputs["ingest"], scene, 1.0)
     for view in scene.views:
         reader.pixels(view, WHITE)
@@ -162,8 +160,8 @@ def test_how_many_photos_are_decoded_at_a_time_follows_from_what_their_files_hol
 
     asked = list[int]()
     inputs, scene = photographed(tmp_path, channels=4)
-    monkeypatch.setattr("stages.io.photos.processors", lambda: 16)
-    monkeypatch.setattr("stages.io.photos.DECODING_BYTES", 2 * 80 * WIDTH * HEIGHT)
+    monkeypatch.setattr("stages.io.pixels.processors", lambda: 16)
+    monkeypatch.setattr("stages.io.pixels.DECODING_BYTES", 2 * 80 * WIDTH * HEIGHT)
     monkeypatch.setattr("stages.io.pixel_store.ThreadPoolExecutor", pool)
     training_dataset(inputs["ingest"], replace(scene, has_alpha=has_alpha), "train", downscale, progress)
     assert asked == [2]
@@ -229,8 +227,8 @@ def test_masks_are_loaded_a_few_at_a_time_and_dropped(
 
     loaded, alive = list[weakref.ref[np.ndarray]](), list[int]()
     inputs, scene = photographed(tmp_path, views=16, mask=half_mask())
-    monkeypatch.setattr("stages.ingest.masks.load_mask", load)
-    monkeypatch.setattr("stages.io.photos.loaders", lambda files: 2)
+    monkeypatch.setattr("stages.train.data.load_mask", load)
+    monkeypatch.setattr("stages.train.data.loaders", lambda files: 2)
     dataset = training_dataset(inputs["ingest"], scene, "train", 1.0, progress)
     assert len(loaded) == 12 and 1 <= max(alive) <= 4
     unmasked_count = dataset.is_unmasked(torch.arange(len(dataset.pixels))).view(12, HEIGHT, WIDTH)

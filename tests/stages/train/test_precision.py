@@ -30,7 +30,7 @@ def here(monkeypatch: pytest.MonkeyPatch):
             widths.append(width)
             return medium
 
-        monkeypatch.setattr("nerf.runtime.matmul_precision.measure_medium_matmul", measured)
+        monkeypatch.setattr("stages.train.precision.measure_medium_matmul", measured)
         return widths
 
     return is_

@@ -76,7 +76,7 @@ def test_the_grid_field_trains_from_photos_too(tmp_path: Path, progress) -> None
     assert flat + 2 < result.facts["heldout_psnr"] < 60
     _, info = load_field(tmp_path / "train")
     assert (info["kind"], info["background"], result.facts["field"]) == ("grid", [1, 1, 1], "grid")
-    assert (info["settings"]["levels"], info["settings"]["finest"]) == (2, 32)
+    assert (info["settings"]["num_levels"], info["settings"]["max_res"]) == (2, 32)
     assert 120 * 8 < info["rays"] < 120 * 8192
     colours = result.facts["samples_per_second"] / result.facts["rays_per_second"]
     assert 0.5 < colours < 100, "of a ray"
