@@ -69,16 +69,16 @@ def frame_seconds(workspace: Path, width: int) -> tuple[float, str]:
     import numpy as np
 
     from stages.render.path import CameraPath, path_rays
-    from stages.render.renderer import load_painter
+    from stages.render.renderer import load_renderer
 
     scene = read_scene(stage_folder(workspace, "scene.json"))
     view = scene.of_split("test")[0]
     path = CameraPath((scene.cameras[view.camera],), np.asarray(view.scene_from_camera)[None]).resized(width)
-    painter, rays = load_painter(stage_folder(workspace, "curve.json")), next(iter(path_rays(path, scene)))
+    renderer, rays = load_renderer(stage_folder(workspace, "curve.json")), next(iter(path_rays(path, scene)))
     seconds = []
     for _ in range(2):
         started = time.perf_counter()
-        painter.draw(rays)
+        renderer.draw(rays)
         seconds.append(time.perf_counter() - started)
     return min(seconds), "×".join(map(str, reversed(rays.near.shape)))
 

@@ -25,7 +25,7 @@ from benchmarks.record import Record, add_out
 from stages.io.files import read_json
 
 EFFECTS = ("exposure", "view_dependence", "background", "pose_refinement")
-FIGURES = {"raw": "psnr", "fitted": "psnr_fitted_right", "posed": "psnr_posed_right"}
+FIGURES = {"raw": "psnr", "fitted": "psnr_exposure_fitted", "posed": "psnr_pose_fitted"}
 JUDGED_BY = {"pose_refinement": "posed"}  # the others: raw
 TOLERATED = 0.3  # dB
 EVERY_PHOTO = 10**6

@@ -71,18 +71,18 @@ def score_ours(workspace: Path) -> float:
     from nerf.training.metrics import mean_squared_error, psnr
     from stages.effects.decisions import expected_gains
     from stages.io.files import read_json, read_scene
-    from stages.render.renderer import load_painter
+    from stages.render.renderer import load_renderer
     from stages.train.config import WHITE
     from stages.train.data import PhotoReader, view_rays
 
     scene, train = read_scene(stage_folder(workspace, "scene.json")), stage_folder(workspace, "curve.json")
-    painter, info = load_painter(train), read_json(train / "field.json")
+    renderer, info = load_renderer(train), read_json(train / "field.json")
     gains = expected_gains(info, scene, scene.of_split("test"))
     ingest, values = stage_folder(workspace, "photos.json"), []
     reader = PhotoReader(ingest, scene, info["downscale"])
     for view in scene.of_split("test"):
         truth = reader.pixels(view, WHITE)
-        at_gain = painter.at_gain(gains[view.name]) if gains else painter
+        at_gain = renderer.at_gain(gains[view.name]) if gains else renderer
         picture = at_gain.draw(view_rays(scene, view, info["downscale"])).colour.clamp(0, 1)
         values.append(psnr(mean_squared_error(picture, truth)))
     return sum(values) / len(values)

@@ -25,7 +25,7 @@ from stages.amounts import resolution_name
 from stages.effects.decisions import expected_gains
 from stages.io.files import read_json, read_scene
 from stages.io.photos import spread
-from stages.render.renderer import Painter, load_painter
+from stages.render.renderer import Renderer, load_renderer
 from stages.train.data import PhotoReader, view_rays
 
 
@@ -58,7 +58,7 @@ def samples_of(model: RadianceModel) -> str:
     return f"{model.settings.samples_coarse} + {model.settings.samples_fine}"
 
 
-def measured(painter: Painter, folders: dict[str, Path], downscale: float, photos: int) -> tuple[float, float]:
+def measured(renderer: Renderer, folders: dict[str, Path], downscale: float, photos: int) -> tuple[float, float]:
     """Mean seconds a frame and mean PSNR (dB) over ``photos`` test photos."""
     scene = read_scene(folders["normalise"])
     test = scene.of_split("test")
@@ -66,9 +66,9 @@ def measured(painter: Painter, folders: dict[str, Path], downscale: float, photo
     reader, seconds, scores = PhotoReader(folders["ingest"], scene, downscale), [], []
     for index in spread(len(test), min(photos, len(test))):
         view = test[index]
-        shown = painter.at_gain(gains[view.name]) if gains else painter
+        shown = renderer.at_gain(gains[view.name]) if gains else renderer
         rays = view_rays(scene, view, downscale)
-        truth = reader.pixels(view, painter.background.tolist())
+        truth = reader.pixels(view, renderer.background.tolist())
         started = time.perf_counter()
         picture = shown.draw(rays).colour.clamp(0, 1)
         seconds.append(time.perf_counter() - started)
@@ -89,10 +89,10 @@ def main() -> None:
     workspace = Workspace.existing(given.workspace)
     keys = workspace.read_run().keys
     folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train")}
-    painter = load_painter(folders["train"])
+    renderer = load_renderer(folders["train"])
     for downscale in given.downscales:
         for factor in given.factors:
-            other = replace(painter, model=with_samples(painter.model, factor))
+            other = replace(renderer, model=with_samples(renderer.model, factor))
             measured(other, folders, max(given.downscales) * 4, 1)  # the first picture pays for memory and kernels
             with torch.no_grad():
                 seconds, score = measured(other, folders, downscale, given.photos)

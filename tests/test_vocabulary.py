@@ -54,7 +54,11 @@ SFM_AND_INGEST: dict[str, str] = {
     r"found no place": "unregistered image",
 }
 
-TRAINING: dict[str, str] = {}
+TRAINING: dict[str, str] = {
+    r"\b(load_)?[Pp]ainter\b": "Renderer",
+    r"\bpsnr_(right|fitted_right|posed_right)\b": "psnr_right_half, psnr_exposure_fitted, psnr_pose_fitted",
+    r"\bparts\.json\b": "profile.json",
+}
 
 MESH_AND_TRADEOFF: dict[str, str] = {
     r"--mesh\.level\b": "--mesh.iso-level",

@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from nerf.geometry.rays import Rays
     from nerf.geometry.scene import Scene, View
     from stages.evaluate.baselines import MeanPhoto
-    from stages.render.renderer import Painter
+    from stages.render.renderer import Renderer
     from stages.train.data import PhotoReader
 
 INPUTS = ("ingest", "normalise", "train")
-VERSION = 12
+VERSION = 13
 EXIT_CODE = 15
 RESUMES = False
 PUBLISHED = ("metrics.json", "renders", "errors")
@@ -47,7 +47,7 @@ NOT_HASHED = ("seconds",)  # it decides how many photos, and that enters the key
 FLEXIBLE = Flexible(share=0.05, min_seconds=2.0, max_seconds=60.0)
 
 BACKGROUNDS = {"white": WHITE, "black": BLACK}
-RIGHT_HALVES = ("psnr_right", "psnr_fitted_right", "psnr_posed_right")
+RIGHT_HALVES = ("psnr_right_half", "psnr_exposure_fitted", "psnr_pose_fitted")
 FIGURES = ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view", *RIGHT_HALVES)
 TRUSTED_WIDTH = 0.5  # of the photos: below, a picture can be sharp and the field know nothing of fine detail
 WORTH_SAYING = 0.5  # dB between two scores of right halves
@@ -175,7 +175,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         progress.note(note)
     images = examiner.score(scored, progress)
     metrics = _overall(images, len(test), examiner.downscale, notes)
-    metrics["background"] = examiner.painter.background.tolist()
+    metrics["background"] = examiner.renderer.background.tolist()
     metrics["exposure"] = "as the photos taken nearest by" if examiner.gains else None
     metrics["poses_fitted"] = examiner.fits_poses
     write_json(folder / "metrics.json", metrics)
@@ -192,7 +192,7 @@ class Examiner:
     scene: "Scene"
     ingest: Path
     folder: Path
-    painter: "Painter"
+    renderer: "Renderer"
     gains: "dict[str, Tensor]"
     fits_poses: bool
     downscale: float
@@ -223,9 +223,9 @@ class Examiner:
         from stages.train.data import view_rays
 
         truth, used = self._photo(view), self.used(view)
-        rendering = self._painter(view).draw(view_rays(self.scene, view, self.downscale), on_chunk)
+        rendering = self._renderer(view).draw(view_rays(self.scene, view, self.downscale), on_chunk)
         image = rendering.colour.clamp(0, 1)
-        background = self.painter.background.cpu()
+        background = self.renderer.background.cpu()
         right, fitted = right_half_psnr(rendering, background, truth, used)
         posed = None
         if self.fits_poses and right is not None:
@@ -242,9 +242,9 @@ class Examiner:
             "ssim": ssim(image, truth, used),
             "psnr_mean_image": _psnr(mean.shown_at(height, width), truth, used),
             "psnr_nearest_view": _psnr(resized(self._photo(nearest), height, width), truth, used),
-            "psnr_right": right,
-            "psnr_fitted_right": fitted,
-            "psnr_posed_right": posed,
+            "psnr_right_half": right,
+            "psnr_exposure_fitted": fitted,
+            "psnr_pose_fitted": posed,
             "nearest_view": nearest.name,
             "render": f"renders/{file}",
             "error": f"errors/{file}",
@@ -257,13 +257,13 @@ class Examiner:
         from stages.evaluate.half_images import from_fitted_pose
         from stages.train.data import view_rays
 
-        model = self.painter.model
+        model = self.renderer.model
         field = model.model if isinstance(model, AppearanceModel) else model
         assert isinstance(field, HashGridField), "only with a hash-grid field does evaluate fit poses"
         rays = view_rays(self.scene, view, self.downscale)
-        as_it_is = replace(self.painter, model=field).draw(rays)
-        moved = from_fitted_pose(field.on_cpu(), rays, as_it_is, self.painter.background.cpu(), truth, used)
-        return self._painter(view).draw(moved)
+        as_it_is = replace(self.renderer, model=field).draw(rays)
+        moved = from_fitted_pose(field.on_cpu(), rays, as_it_is, self.renderer.background.cpu(), truth, used)
+        return self._renderer(view).draw(moved)
 
     @cached_property
     def _reader(self) -> "PhotoReader":
@@ -272,28 +272,28 @@ class Examiner:
         return PhotoReader(self.ingest, self.scene, self.downscale)
 
     def _photo(self, view: "View") -> "Tensor":
-        return self._reader.pixels(view, self.painter.background.tolist())
+        return self._reader.pixels(view, self.renderer.background.tolist())
 
     def used(self, view: "View") -> "Tensor | None":
         from stages.train.data import view_mask
 
         return view_mask(self.ingest, self.scene, view, self.downscale)
 
-    def _painter(self, view: "View") -> "Painter":
-        return self.painter.at_gain(self.gains[view.name]) if self.gains else self.painter
+    def _renderer(self, view: "View") -> "Renderer":
+        return self.renderer.at_gain(self.gains[view.name]) if self.gains else self.renderer
 
 
 def _examiner(config: Config, scene: "Scene", inputs: Inputs, folder: Path, progress: Progress) -> Examiner:
     """Load the field; data with alpha goes over the background asked for, the rest over what the field expects."""
     from stages.effects.decisions import expected_gains
-    from stages.render.renderer import load_painter
+    from stages.render.renderer import load_renderer
 
     assert config.downscale is not None
     chosen = config.background if scene.has_alpha else None
-    painter = load_painter(inputs["train"], BACKGROUNDS[chosen] if chosen else None, progress)
+    renderer = load_renderer(inputs["train"], BACKGROUNDS[chosen] if chosen else None, progress)
     field = read_json(inputs["train"] / "field.json")
     gains = expected_gains(field, scene, scene.of_split("test"))
-    return Examiner(scene, inputs["ingest"], folder, painter, gains, fits_poses(config, field), config.downscale)
+    return Examiner(scene, inputs["ingest"], folder, renderer, gains, fits_poses(config, field), config.downscale)
 
 
 def fits_poses(config: Config, field: dict[str, Any]) -> bool:
@@ -359,7 +359,7 @@ def _overall(images: list[dict[str, Any]], test_photos: int, downscale: float, n
         notes = [*notes, f"{UNMEASURED[test_photos > 0]}, so nothing is measured"]
     elif len(images) < MIN_FOR_INTERVAL:
         notes = [*notes, f"no interval: {_photos(len(images))} cannot show how much the figures vary"]
-    if small := sum(image["psnr_right"] is None for image in images):
+    if small := sum(image["psnr_right_half"] is None for image in images):
         notes = [*notes, f"a half of {_photos(small)} has too few pixels to fit an exposure on or to score with it"]
     metrics |= {
         "lpips": None,

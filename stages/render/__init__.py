@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from nerf.fields.interface import Rendering
     from nerf.geometry.rays import Rays
     from nerf.geometry.scene import Scene
-    from stages.render.renderer import Allowance, Painter
+    from stages.render.renderer import Allowance, Renderer
 
 INPUTS = ("normalise", "train")
 VERSION = 13
@@ -182,19 +182,19 @@ def _check(config: Config) -> None:
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Render the path and write video.mp4, depth.mp4, path.json and, if asked, frames/."""
-    from stages.render.renderer import load_painter
+    from stages.render.renderer import load_renderer
 
     config = plan(config, inputs, progress)
     assert config.width is not None and config.fps is not None
     scene = read_scene(inputs["normalise"])
-    painter = load_painter(inputs["train"], progress=progress)
+    renderer = load_renderer(inputs["train"], progress=progress)
     gain, exposure = _exposure(config.match_exposure, inputs["train"], scene, progress)
-    painter = painter if gain is None else painter.at_gain(gain)
+    renderer = renderer if gain is None else renderer.at_gain(gain)
     path = _path(config, scene).resized(config.width)
     _check_memory(path)
     write_json(folder / "path.json", _path_json(path, scene, config.fps))
     started = time.perf_counter()
-    renderings = _render(path, scene, painter, progress)
+    renderings = _render(path, scene, renderer, progress)
     outputs = ("path.json", *_write(renderings, path, config, folder))
     frames_per_second = len(path.cameras) / (time.perf_counter() - started)
     write_json(folder / "speed.json", {"frames_per_second": frames_per_second})
@@ -224,7 +224,7 @@ def _path(config: Config, scene: "Scene") -> CameraPath:
     return fitted_path(scene, config.path, config.frames or MIN_FRAMES)
 
 
-def _render(path: CameraPath, scene: "Scene", painter: "Painter", progress: Progress) -> "Iterator[Rendering]":
+def _render(path: CameraPath, scene: "Scene", renderer: "Renderer", progress: Progress) -> "Iterator[Rendering]":
     """The frames, one by one, on the CPU."""
     count, started = len(path.cameras), time.perf_counter()
     for index, rays in enumerate(path_rays(path, scene)):
@@ -234,7 +234,7 @@ def _render(path: CameraPath, scene: "Scene", painter: "Painter", progress: Prog
             left = (time.perf_counter() - started) * (1 - done) / done
             progress.update(f"frame {index + 1} of {count} · {duration(left)} left", done)
 
-        yield painter.draw(rays, on_chunk)
+        yield renderer.draw(rays, on_chunk)
 
 
 def _write(renderings: "Iterator[Rendering]", path: CameraPath, config: Config, folder: Path) -> list[str]:

@@ -25,13 +25,13 @@ FIRST_SIDE = 24  # pixels
 
 
 @dataclass(frozen=True)
-class Painter:
+class Renderer:
     """A trained field, where it is computed, and what it is shown over."""
 
     model: "RadianceModel"
     background: "Tensor"  # (3,), on the model's device
 
-    def at_gain(self, log_gain: "Tensor") -> "Painter":
+    def at_gain(self, log_gain: "Tensor") -> "Renderer":
         """This field at another gain than the neutral one; only for a field that models exposure."""
         from nerf.effects.appearance import AppearanceModel
         from nerf.effects.exposure import ExposureModel
@@ -65,7 +65,9 @@ class Painter:
             side = min(math.ceil(side * math.sqrt(2)), largest)
 
 
-def load_painter(train: Path, background: tuple[float, ...] | None = None, progress: Progress | None = None) -> Painter:
+def load_renderer(
+    train: Path, background: tuple[float, ...] | None = None, progress: Progress | None = None
+) -> Renderer:
     """The field that stage train left in ``train``, over ``background``, which a field with a sky does not show; None:
     what it was trained to stand before. One that models exposure is shown at its neutral one. ``progress`` is told
     where the field is computed by torch's kernels alone."""
@@ -76,7 +78,7 @@ def load_painter(train: Path, background: tuple[float, ...] | None = None, progr
 
     device = compute_device()
     model, info = load_field(train, device, progress)
-    return Painter(model, torch.tensor(info["background"] if background is None else background, device=device))
+    return Renderer(model, torch.tensor(info["background"] if background is None else background, device=device))
 
 
 class Allowance:
@@ -108,4 +110,4 @@ def trained_seconds(train: Path) -> float:
 def measured_speed(train: Path, sample: "Callable[[int], Rays]", largest: int) -> float:
     """Rays per second that the field in ``train`` draws on this machine, found in no more than a second or two."""
     seconds = min(TIMED_SECONDS, TIMED_SHARE * trained_seconds(train))
-    return load_painter(train).rays_per_second(sample, largest, seconds)
+    return load_renderer(train).rays_per_second(sample, largest, seconds)

@@ -80,7 +80,9 @@ def read_results(inputs: Inputs, stages: Sequence[str]) -> Results:
         effects=of("effects", "effects.json"),
         field=of("train", "field.json"),
         curve=of("train", "curve.json"),
-        parts=of("train", "parts.json") if "train" in inputs and (inputs["train"] / "parts.json").exists() else None,
+        parts=of("train", "profile.json")
+        if "train" in inputs and (inputs["train"] / "profile.json").exists()
+        else None,
         metrics=of("evaluate", "metrics.json"),
         study=of("tradeoff", "tradeoff.json"),
     )

@@ -30,7 +30,7 @@ from stages.evaluate.image_metrics import ssim
 from stages.io.files import read_json, sync_file, write_json_durably, write_png
 from stages.io.photos import spread
 from stages.io.stopwatch import periodically
-from stages.render.renderer import TIMED_SECONDS, load_painter
+from stages.render.renderer import TIMED_SECONDS, load_renderer
 from stages.tradeoff.schedule import SCORING_STRIDE, SMALL_SIDE, WORKSPACE_FIELD, Run, scoring_stride
 from stages.train.config import BLACK, WHITE
 from stages.train.data import ALL_MASKED, PhotoReader, scaled_size, view_mask, view_rays
@@ -212,7 +212,7 @@ def rendering_seconds(field: Path, benchmark: Benchmark) -> float:
         return benchmark.crops[0].part((some, some)).rays
 
     rays = sum(crop.rays.near.numel() for crop in benchmark.crops)
-    return rays / load_painter(field, benchmark.background).rays_per_second(sample, CROP_SIZE, TIMED_SECONDS)
+    return rays / load_renderer(field, benchmark.background).rays_per_second(sample, CROP_SIZE, TIMED_SECONDS)
 
 
 def render_photos(field: Path, benchmark: Benchmark) -> list[Tensor]:
@@ -223,11 +223,11 @@ def render_photos(field: Path, benchmark: Benchmark) -> list[Tensor]:
 def _renderer(field: Path, benchmark: Benchmark) -> Callable[[Crop], Tensor]:
     """What renders a crop by the field in a folder, in [0, 1], over the benchmark's background, at the exposure
     expected of its photo."""
-    painter = load_painter(field, benchmark.background)
+    renderer = load_renderer(field, benchmark.background)
     gains = expected_gains(read_json(field / "field.json"), benchmark.scene, benchmark.scene.of_split("test"))
 
     def render(crop: Crop) -> Tensor:
-        exposed = painter.at_gain(gains[crop.photo]) if gains else painter
+        exposed = renderer.at_gain(gains[crop.photo]) if gains else renderer
         return exposed.draw(crop.rays).colour.clamp(0, 1)
 
     return render

@@ -21,7 +21,7 @@ from stages.train.fields import field_of
 
 TIMED_EVERY, FIRST_TIMED = 32, 8  # steps: one of so many is timed; the very first ones are unlike the others
 RATES_SECONDS = 0.5  # to measure the machine's rates in, once training has ended
-PARTS_FILE = "parts.json"
+PARTS_FILE = "profile.json"
 WAITING = "waiting"
 
 
@@ -44,7 +44,7 @@ def observed(take: Callable[[], StepResult], step: int, timings: dict[str, Any],
 
 
 def parts_table(timings: dict[str, Any], rates: Rates) -> dict[str, Any]:
-    """The content of parts.json, from what :func:`observed` noted of at least one step.
+    """The content of profile.json, from what :func:`observed` noted of at least one step.
 
     ``samples`` are points whose colour was computed, ``densities`` points whose density was asked for.
     Shares are of the cores' time, and sum to 1: what no core computed is ``waiting``. ``floor`` is the time that a
@@ -69,7 +69,7 @@ def parts_table(timings: dict[str, Any], rates: Rates) -> dict[str, Any]:
 
 
 def write_parts(folder: Path, timings: dict[str, Any], config: Config, device: torch.device) -> list[str]:
-    """Measure the machine and write parts.json; the names of the files written: none where no step was timed."""
+    """Measure the machine and write profile.json; the names of the files written: none where no step was timed."""
     if not timings:
         return []
     field = field_of(config)

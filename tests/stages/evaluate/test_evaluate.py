@@ -100,7 +100,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
         info = {"kind": "sky", "downscale": downscale, "background": [0.0, 0.0, 0.0]}
         write_json(inputs["train"] / "field.json", info)
         write_json(inputs["train"] / "curve.json", {"points": [{"seconds": 2.0}]})
-        monkeypatch.setattr("stages.render.renderer.Painter.rays_per_second", lambda *_: speed)
+        monkeypatch.setattr("stages.render.renderer.Renderer.rays_per_second", lambda *_: speed)
         monkeypatch.setattr("stages.hardware.device.compute_device", lambda: "cpu")
         monkeypatch.setattr("stages.io.field_files.load_field", lambda *_: (field or SkyField(), info))
         return inputs
@@ -133,9 +133,9 @@ def test_psnr_of_a_constant_error_is_its_closed_form(error: float, make: Make, t
 def test_overall_figures_are_the_means_of_the_photos(make: Make, tmp_path: Path, progress: Any):
     metrics, _ = _run(make(SkyField(0.1)), tmp_path / "out", progress)
     assert [image["name"] for image in metrics["images"]] == ["001.jpg", "004.jpg", "007.jpg", "010.jpg"]
-    for key in set(evaluate.FIGURES) - {"psnr_posed_right"}:
+    for key in set(evaluate.FIGURES) - {"psnr_pose_fitted"}:
         assert metrics[key] == pytest.approx(np.mean([image[key] for image in metrics["images"]]))
-    assert metrics["psnr_posed_right"] is None and not metrics["poses_fitted"]
+    assert metrics["psnr_pose_fitted"] is None and not metrics["poses_fitted"]
     low, high = metrics["psnr_interval"]
     assert low <= metrics["psnr"] <= high
     assert all(image["nearest_view"] not in ("001.jpg", "004.jpg") for image in metrics["images"])
@@ -200,9 +200,9 @@ def test_the_exposure_of_a_test_photo_is_no_fault_of_the_field(stops: float, mak
     log_gain = stops * math.log(2)
     metrics, line = _run(exposed(make(), log_gain, 0.03), tmp_path / "out", progress)
     noise_alone = -20 * math.log10(0.03)
-    assert metrics["psnr_fitted_right"] == pytest.approx(noise_alone, abs=0.1)
-    assert metrics["psnr"] < noise_alone - 6 and metrics["psnr_right"] < noise_alone - 6
-    right, fitted = metrics["psnr_right"], metrics["psnr_fitted_right"]
+    assert metrics["psnr_exposure_fitted"] == pytest.approx(noise_alone, abs=0.1)
+    assert metrics["psnr"] < noise_alone - 6 and metrics["psnr_right_half"] < noise_alone - 6
+    right, fitted = metrics["psnr_right_half"], metrics["psnr_exposure_fitted"]
     words = f"right halves {right:.1f} dB, {fitted:.1f} dB with its exposure fitted on the left half · nearest photo"
     assert words in line and line.startswith(f"{metrics['psnr']:.1f} ± ")
     assert f"{metrics['psnr']:.1f} dB" in metrics["verdict"], "the verdict keeps the raw score"
@@ -210,20 +210,20 @@ def test_the_exposure_of_a_test_photo_is_no_fault_of_the_field(stops: float, mak
 
 def test_without_a_gain_both_scores_of_right_halves_agree(make: Make, tmp_path: Path, progress: Any):
     metrics, line = _run(exposed(make(), 0.0, 0.03), tmp_path / "out", progress)
-    assert metrics["psnr_fitted_right"] == pytest.approx(metrics["psnr_right"], abs=0.05)
-    assert metrics["psnr_right"] == pytest.approx(metrics["psnr"], abs=0.3)
-    assert "right" not in line and metrics["psnr_fitted_right"] != metrics["psnr_right"]
+    assert metrics["psnr_exposure_fitted"] == pytest.approx(metrics["psnr_right_half"], abs=0.05)
+    assert metrics["psnr_right_half"] == pytest.approx(metrics["psnr"], abs=0.3)
+    assert "right" not in line and metrics["psnr_exposure_fitted"] != metrics["psnr_right_half"]
 
 
 def test_masks_count_in_the_scores_of_right_halves(make: Make, tmp_path: Path, progress: Any):
     ignore = np.zeros((HEIGHT, WIDTH), bool)
     ignore[:, 4:9] = ignore[:14, 20:] = True
     metrics, _ = _run(masked(make(), ignore), tmp_path / "out", progress)
-    assert min(image["psnr_fitted_right"] for image in metrics["images"]) > 50
+    assert min(image["psnr_exposure_fitted"] for image in metrics["images"]) > 50
     ignore[:, 4 : WIDTH // 2] = True  # 96 pixels of the left half are left
     ignore[:10, :4] = True  # 56
     metrics, line = _run(masked(make_again(tmp_path), ignore), tmp_path / "narrow", progress)
-    assert all(metrics[key] is None for key in ("psnr_right", "psnr_fitted_right")) and metrics["psnr"] > 25
+    assert all(metrics[key] is None for key in ("psnr_right_half", "psnr_exposure_fitted")) and metrics["psnr"] > 25
     assert "a half of 4 photos has too few pixels to fit an exposure on or to score with it" in metrics["notes"]
     assert "right" not in line
 
@@ -359,7 +359,7 @@ def test_poses_cannot_be_fitted_to_a_field_without_gradients_of_rays(make: Make,
     with refused("evaluate.no-pose-fit", "sky"):
         _run(inputs, tmp_path / "on", progress, fit_poses="on")
     metrics, _ = _run(inputs, tmp_path / "auto", progress)
-    assert metrics["psnr_posed_right"] is None and not metrics["poses_fitted"]
+    assert metrics["psnr_pose_fitted"] is None and not metrics["poses_fitted"]
 
 
 @pytest.mark.parametrize(("seconds", "count"), [(0.9, 1), (2.9, 2), (5.0, 4), (0.01, 1)])

@@ -18,7 +18,7 @@ from stages.effects.decisions import Decisions, image_effects, learnt_of_photos
 from stages.evaluate import Examiner
 from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
 from stages.hardware.backend import chosen_backend, load_backend
-from stages.render.renderer import Painter
+from stages.render.renderer import Renderer
 from stages.train.data import PhotoReader, training_dataset, view_rays
 from tests.stages.photo_scene import photographed
 from tests.synthetic_photos import Quiet
@@ -32,7 +32,7 @@ def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_expo
     field = HashGridField(
         HashGridSettings(num_levels=2, log2_hashmap_size=8, base_res=4, max_res=16, occupancy_resolution=8), 5, kernels
     )
-    plain, gain = Painter(field, torch.zeros(3)), torch.full((3,), 0.7)
+    plain, gain = Renderer(field, torch.zeros(3)), torch.full((3,), 0.7)
     view, given = scene.of_split("test")[0], []
 
     def fit(model: HashGridField, rays: Rays, rendering: Rendering, *_: object) -> Rays:
@@ -40,7 +40,7 @@ def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_expo
         return rays._replace(near=rays.near + 0.5)  # seen from elsewhere
 
     monkeypatch.setattr("stages.evaluate.half_images.from_fitted_pose", fit)
-    neutral = Painter(AppearanceModel(field, (ExposureModel(torch.full((1, 3), 0.3)),)), torch.zeros(3))
+    neutral = Renderer(AppearanceModel(field, (ExposureModel(torch.full((1, 3), 0.3)),)), torch.zeros(3))
     examiner = Examiner(scene, inputs["ingest"], tmp_path, neutral, {view.name: gain}, True, 1.0)
     (scored,) = examiner.score([view], Quiet())
     rays = view_rays(scene, view, 1.0)
@@ -49,8 +49,8 @@ def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_expo
     exposed = neutral.at_gain(gain)
     right, fitted = right_half_psnr(exposed.draw(rays), torch.zeros(3), truth)
     _, posed = right_half_psnr(exposed.draw(rays._replace(near=rays.near + 0.5)), torch.zeros(3), truth)
-    assert scored["psnr_right"] == pytest.approx(right) and scored["psnr_fitted_right"] == pytest.approx(fitted)
-    assert scored["psnr_posed_right"] == pytest.approx(posed)
+    assert scored["psnr_right_half"] == pytest.approx(right) and scored["psnr_exposure_fitted"] == pytest.approx(fitted)
+    assert scored["psnr_pose_fitted"] == pytest.approx(posed)
 
 
 def test_refined_poses_are_learnt_in_units_of_what_photos_see_and_written_in_scene_units(tmp_path: Path) -> None:

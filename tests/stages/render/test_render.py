@@ -71,7 +71,9 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     info = {"background": [0.0, 0.0, 1.0], "downscale": 1.0, "rays": 100_000}
     write_json(folders["train"] / "field.json", info)
     write_json(folders["train"] / "curve.json", {"points": [{"step": 9, "seconds": 10.0}]})
-    monkeypatch.setattr("stages.render.renderer.Painter.rays_per_second", lambda self, sample, largest, seconds: 30_000)
+    monkeypatch.setattr(
+        "stages.render.renderer.Renderer.rays_per_second", lambda self, sample, largest, seconds: 30_000
+    )
     monkeypatch.setattr("stages.io.field_files.load_field", lambda *_: (Ball(), info))
     return folders
 

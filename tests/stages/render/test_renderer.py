@@ -1,4 +1,4 @@
-"""What a painter draws, and how its speed is found."""
+"""What a renderer draws, and how its speed is found."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,7 +9,7 @@ import torch
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from stages.io.files import write_json
-from stages.render.renderer import Allowance, Painter, trained_seconds
+from stages.render.renderer import Allowance, Renderer, trained_seconds
 
 
 class Slow:
@@ -37,13 +37,13 @@ def square(side: int) -> Rays:
     return Rays(grid, grid, grid[..., 0], grid[..., 1])
 
 
-def painter(seconds_per_ray: float = 0.0) -> Painter:
-    return Painter(Slow(seconds_per_ray), torch.tensor([1.0, 2.0, 3.0]))
+def renderer(seconds_per_ray: float = 0.0) -> Renderer:
+    return Renderer(Slow(seconds_per_ray), torch.tensor([1.0, 2.0, 3.0]))
 
 
 def test_a_picture_has_every_ray_in_its_place() -> None:
     shares: list[float] = []
-    picture = painter().draw(square(40), shares.append)
+    picture = renderer().draw(square(40), shares.append)
     torch.testing.assert_close(picture.colour, square(40).directions * torch.tensor([1.0, 2.0, 3.0]))
     assert picture.depth.shape == picture.opacity.shape == (40, 40)
     assert shares == sorted(shares) and shares[-1] == 1.0
@@ -53,18 +53,18 @@ def test_a_picture_has_every_ray_in_its_place() -> None:
 def test_the_speed_found_is_the_fields(seconds_per_ray: float, monkeypatch: pytest.MonkeyPatch) -> None:
     field = Slow(seconds_per_ray)
     monkeypatch.setattr("stages.render.renderer.time", SimpleNamespace(perf_counter=lambda: field.now))
-    speed = Painter(field, torch.zeros(3)).rays_per_second(square, 100, 0.02)
+    speed = Renderer(field, torch.zeros(3)).rays_per_second(square, 100, 0.02)
     assert speed == pytest.approx(1 / seconds_per_ray)
 
 
 def test_timing_ends_at_the_largest_picture() -> None:
     field = Slow(0.0)
-    Painter(field, torch.zeros(3)).rays_per_second(square, 50, 1e9)
+    Renderer(field, torch.zeros(3)).rays_per_second(square, 50, 1e9)
     assert field.rays == 24**2 + 24**2 + 34**2 + 49**2 + 50**2
 
 
 def test_a_picture_smaller_than_the_first_one_tried_will_do() -> None:
-    assert painter().rays_per_second(square, 5, 1e9) > 0
+    assert renderer().rays_per_second(square, 5, 1e9) > 0
 
 
 def test_training_took_as_long_as_its_curve_says(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ def _write_training(folder: Path) -> None:
     about = {"field": "grid", "device": "cpu", "threads": 2, "whole": True}
     write_json(folder / "curve.json", about | {"points": curve})
     write_json(folder / "field.json", {"kind": "paper", "downscale": 1.0, "steps": 600, "rays": 600_000})
-    write_json(folder / "parts.json", PARTS)
+    write_json(folder / "profile.json", PARTS)
 
 
 def _write_metrics(folder: Path, scene: Scene, size: tuple[int, int]) -> None:
@@ -140,10 +140,10 @@ def _write_metrics(folder: Path, scene: Scene, size: tuple[int, int]) -> None:
         _picture(rank * 4, size, blur=True).save(folder / "renders" / file)
         Image.new("RGB", size, (60 + rank, 20, 80)).save(folder / "errors" / file)
         figures = {"psnr": 19.0 + rank, "ssim": 0.5 + rank / 20, "psnr_mean_image": 12.9, "psnr_nearest_view": 14.2}
-        figures |= {"psnr_right": 18.5 + rank, "psnr_fitted_right": 23.25 + rank, "psnr_posed_right": None}
+        figures |= {"psnr_right_half": 18.5 + rank, "psnr_exposure_fitted": 23.25 + rank, "psnr_pose_fitted": None}
         images.append({"name": view.name, "render": f"renders/{file}", "error": f"errors/{file}"} | figures)
     overall = {"psnr": 21.5, "ssim": 0.62, "psnr_mean_image": 12.9, "psnr_nearest_view": 14.2}
-    overall |= {"psnr_right": 21.0, "psnr_fitted_right": 25.8, "psnr_posed_right": None}
+    overall |= {"psnr_right_half": 21.0, "psnr_exposure_fitted": 25.8, "psnr_pose_fitted": None}
     overall |= {"poses_fitted": False, "exposure": None}
     counts = {
         "background": [1.0, 1.0, 1.0],

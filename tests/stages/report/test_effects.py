@@ -17,7 +17,7 @@ def test_page_shows_both_scores_of_right_halves_with_what_they_mean(tmp_path: Pa
     assert "On the right halves of the photos: 21.0 dB, and 25.8 dB with the exposure of each photo fitted" in html
     path = inputs["evaluate"] / "metrics.json"
     metrics = json.loads(path.read_text("utf-8"))
-    unknown = {"psnr_right": None, "psnr_fitted_right": None}
+    unknown = {"psnr_right_half": None, "psnr_exposure_fitted": None}
     write_json(path, metrics | unknown | {"images": [image | unknown for image in metrics["images"]]})
     html, _ = written(inputs, tmp_path / "unknown", progress)
     assert "On the right halves" not in html and '<td class="number">–</td><td class="number">–</td></tr>' in html
@@ -39,8 +39,8 @@ def test_page_shows_what_fitted_poses_add_apart_from_fitted_exposures(tmp_path: 
     assert "pose fitted" not in html
     path = inputs["evaluate"] / "metrics.json"
     metrics = json.loads(path.read_text("utf-8"))
-    images = [image | {"psnr_posed_right": image["psnr_fitted_right"] + 2} for image in metrics["images"]]
-    write_json(path, metrics | {"psnr_posed_right": 27.8, "poses_fitted": True, "images": images})
+    images = [image | {"psnr_pose_fitted": image["psnr_exposure_fitted"] + 2} for image in metrics["images"]]
+    write_json(path, metrics | {"psnr_pose_fitted": 27.8, "poses_fitted": True, "images": images})
     html, _ = written(inputs, tmp_path / "posed", progress)
     assert "right half, exposure and pose fitted on the left (dB)</th>" in html
     assert '<td class="number">23.50</td><td class="number">28.25</td><td class="number">30.25</td></tr>' in html

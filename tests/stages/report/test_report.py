@@ -328,7 +328,7 @@ def test_training_shows_where_its_time_went(inputs: dict[str, Path], tmp_path: P
 
 
 def test_a_training_without_timed_steps_is_no_fault(inputs: dict[str, Path], tmp_path: Path, progress: Any):
-    (inputs["train"] / "parts.json").unlink()
+    (inputs["train"] / "profile.json").unlink()
     html, summary = written(inputs, tmp_path / "out", progress)
     assert "Where training spent its time" not in html and summary["training_parts"] is None
 

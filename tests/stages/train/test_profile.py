@@ -177,8 +177,8 @@ def test_the_file_is_written_where_a_step_was_timed(tmp_path: Path, monkeypatch:
     of, timings, config = trainer("paper"), {}, Config(field="paper", width=16)
     assert write_parts(tmp_path, timings, config, CPU) == []
     timed_step(of, FIRST_TIMED, timings)
-    assert write_parts(tmp_path, timings, config, CPU) == ["parts.json"]
-    assert read_json(tmp_path / "parts.json") == parts_table(timings, RATES)
+    assert write_parts(tmp_path, timings, config, CPU) == ["profile.json"]
+    assert read_json(tmp_path / "profile.json") == parts_table(timings, RATES)
     assert asked == [(CPU, 16, 1, RATES_SECONDS)]
 
 
