@@ -64,7 +64,7 @@ def geometric(
 
 def test_what_serves_several_effects_is_shared_out_among_them(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr("stages.effects.evidence.time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr("stages.effects.study.time", SimpleNamespace(perf_counter=lambda: now[0]))
 
     def works(seconds: float, said: Any = None) -> Any:
         now[0] += seconds
