@@ -57,7 +57,10 @@ def run_worker(
                 for message in map(json.loads, child.stdout):
                     if note := message.pop("note", None):
                         progress.note(note)
+                    begins = message.get("phase", latest["phase"]) != latest["phase"]
                     latest.update(message)
+                    if begins:  # a phase may take less than the live line waits
+                        progress.update(*_describe(latest, len(photos)))
             code = child.wait()
         finally:
             late = not overtime.is_alive()
