@@ -84,7 +84,7 @@ class Runner:
         where the photos or a file that a setting names cannot be read: the stage that reads it says so."""
         try:
             to_run = [name for name in stages if name in again or self.found(name) is None]
-            if all(declared(STAGES[name], "SUMMARY") for name in to_run):
+            if all(is_summary(name, STAGES) for name in to_run):
                 return Forecast([], {})
             photos = photos_of(self.options[SOURCE])
             if photos is None:

@@ -26,7 +26,7 @@ _MASK = re.compile(r"(.+[ ._-])?masks?([ ._-]?\d+)?", re.IGNORECASE)
 # Of a depth map there is a photo, but for a few that were lost; of photos in grey there need not be any in colour.
 _MIN_COLOURED = 0.9
 
-Stored = Literal["colour", "grey", "deep grey"]  # the last of 16 bits or of floats
+Stored = Literal["colour", "grey", "deep grey"]
 """How a file stores its values; the last of 16 bits or floats."""
 _Key = tuple[PurePosixPath, str]  # a folder, and what a photo in it is called
 

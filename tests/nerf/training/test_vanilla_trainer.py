@@ -14,6 +14,7 @@ from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from nerf.training.trainer import NonFinite, over
 from nerf.training.validation_probe import make_probe, measure
 from nerf.training.vanilla_trainer import VanillaTrainer, VanillaTrainerSettings
+from tests.nerf.training.test_hash_grid_trainer import copied, same
 
 FIELD = VanillaSettings(
     depth=2, width=16, skip=9, position_frequencies=3, direction_frequencies=1, samples_coarse=8, samples_fine=8
@@ -41,14 +42,6 @@ def small_dataset(channels: int = 3, size: int = 12) -> RayDataset:
 
 def trainer(settings: VanillaTrainerSettings = TRAINER, dataset: RayDataset | None = None) -> VanillaTrainer:
     return VanillaTrainer(VanillaNerf(FIELD, seed=0), dataset or small_dataset(), settings)
-
-
-def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
-    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
-
-
-def copied(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name: tensor.clone() for name, tensor in state.items()}
 
 
 def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit() -> None:

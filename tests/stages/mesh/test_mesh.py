@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from trimesh.visual import ColorVisuals
 
 from nerf.geometry.camera_paths import look_at
 from nerf.geometry.scene import Camera, Scene, Similarity, View
@@ -19,6 +18,7 @@ from stages.io.files import write_json, write_tensors
 from stages.mesh import extraction, preview, resolution, visibility
 from stages.mesh.extraction import vertex_colours
 from tests.refusals import refused
+from tests.stages.mesh.test_files import colours_of, upright_mesh
 
 RADIUS = 0.4
 TURN = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
@@ -195,19 +195,6 @@ def test_glb_stands_upright_and_the_scene_frame_can_be_had(run_mesh):
         np.testing.assert_allclose(np.linalg.norm(vertices - centre, axis=1), scale * RADIUS, atol=scale * VOXEL)
     scene_vertices = np.asarray(trimesh.load_mesh(folder / "mesh.ply", process=False).vertices)
     np.testing.assert_allclose(vertices, scene_vertices @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]), atol=1e-6)
-
-
-def colours_of(loaded):
-    visual = loaded.visual
-    assert isinstance(visual, ColorVisuals)
-    return np.asarray(visual.vertex_colors)[:, :3].astype(int)
-
-
-def upright_mesh(path):
-    """The mesh of a GLB with its nodes' transforms applied."""
-    geometry = trimesh.load_scene(path, process=False).to_geometry()
-    assert isinstance(geometry, trimesh.Trimesh)
-    return geometry
 
 
 def mesh_centre_upright():
