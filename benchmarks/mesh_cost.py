@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.record import Record, add_out
-from nerf import REGION_HALF
+from nerf import REGION_HALF_SIZE
 from pipeline.demo.truth import Truth, compare_with_truth
 from pipeline.engine.workspace import Workspace
 from stages.contract import Inputs
@@ -58,9 +58,9 @@ def to_points(mesh: "ColouredMesh", points: np.ndarray) -> dict[str, float]:
     """From the sparse points in the region to the mesh: median, and nine in ten, in percent of the region's size."""
     from scipy.spatial import KDTree
 
-    inside = points[np.abs(points).max(1) < REGION_HALF]
+    inside = points[np.abs(points).max(1) < REGION_HALF_SIZE]
     distance = KDTree(sample_surface(mesh.vertices, mesh.faces, SAMPLES, seed=0)).query(inside)[0]
-    median, most = np.percentile(distance, [50, 90]) * 100 / (2 * REGION_HALF)
+    median, most = np.percentile(distance, [50, 90]) * 100 / (2 * REGION_HALF_SIZE)
     return {"point_to_mesh_percent": median, "nine_in_ten_percent": most}
 
 

@@ -14,7 +14,7 @@ from nerf.rendering.images import render_image
 from nerf.runtime.randomness import generator
 from nerf.training.metrics import mean_squared_error, psnr
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.trainer import over
+from nerf.training.trainer import composite_over
 
 
 class Probe(NamedTuple):
@@ -72,7 +72,7 @@ def make_patches(dataset: RayDataset, count: int, side: int, background: Float[T
 
 def _probe_of(dataset: RayDataset, pixels: Int[Tensor, "rays"], background: Float[Tensor, "3"]) -> Probe:
     rays, colour, alpha, view = dataset.lookup(pixels)
-    return Probe(rays, over(colour, alpha, background), background, view)
+    return Probe(rays, composite_over(colour, alpha, background), background, view)
 
 
 @torch.no_grad()

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from nerf import REGION_HALF
+from nerf import REGION_HALF_SIZE
 from stages.amounts import duration
 from stages.io.figures import INK, svg_element, svg_figure
 from stages.train.curve import heldout_curve
@@ -109,7 +109,7 @@ def _layout_svg(
     from matplotlib.patches import Rectangle
 
     centres = np.array([view.scene_from_camera[:, 3] for view in views])[:, plane]
-    low, high = np.minimum(centres.min(0), -REGION_HALF), np.maximum(centres.max(0), REGION_HALF)
+    low, high = np.minimum(centres.min(0), -REGION_HALF_SIZE), np.maximum(centres.max(0), REGION_HALF_SIZE)
     middle, half = (low + high) / 2, (high - low) / 2 + 0.06 * (high - low).max()
     xyz, rgb = points
     shown = np.linspace(0, len(xyz) - 1, min(len(xyz), MAX_POINTS)).astype(int)
@@ -118,7 +118,13 @@ def _layout_svg(
         axes.scatter(*xyz[shown][:, plane].T, c=rgb[shown] / 255, s=2, lw=0, alpha=0.7, rasterized=True)
         axes.add_patch(
             Rectangle(
-                (-REGION_HALF, -REGION_HALF), 2 * REGION_HALF, 2 * REGION_HALF, fill=False, ec=INK, ls="--", alpha=0.6
+                (-REGION_HALF_SIZE, -REGION_HALF_SIZE),
+                2 * REGION_HALF_SIZE,
+                2 * REGION_HALF_SIZE,
+                fill=False,
+                ec=INK,
+                ls="--",
+                alpha=0.6,
             )
         )
         _draw_cameras(axes, scene, views, plane, 0.1 * half.max(), joined)

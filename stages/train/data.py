@@ -12,7 +12,7 @@ import torch
 
 from nerf.geometry.rays import Rays, rays_of_view
 from nerf.training.ray_dataset import PosedViews, RayDataset, make_ray_dataset
-from nerf.training.trainer import over
+from nerf.training.trainer import composite_over
 from stages.contract import Inputs, Progress, StageError
 from stages.effects.track_colours import training_tracks
 from stages.io.files import read_tensors
@@ -147,7 +147,7 @@ class PhotoReader:
         """The photo of a view as (H, W, 3) float32 in [0, 1], over ``background`` where it has alpha."""
         pixels = torch.tensor(self._pixels(view)).float() / 255
         alpha = pixels[..., 3] if self.scene.has_alpha else None
-        return over(pixels[..., :3], alpha, torch.tensor(background, dtype=torch.float32))
+        return composite_over(pixels[..., :3], alpha, torch.tensor(background, dtype=torch.float32))
 
     def _pixels(self, view: "View") -> np.ndarray:
         """The photo of a view as uint8, out of the pixel store where that is there."""

@@ -23,7 +23,7 @@ from pathlib import Path
 from safetensors.torch import save
 
 from nerf.training.schedule import CLOSING_SHARE, ScheduleRevision, StepSchedule, next_in_series, replanned, schedule_of
-from nerf.training.trainer import RAYS, FieldTrainer, NonFinite
+from nerf.training.trainer import RAY_GEOMETRY, FieldTrainer, NonFinite
 from nerf.training.validation_probe import ProbeResult, measure
 from stages.amounts import short_count
 from stages.contract import Progress, StageError
@@ -199,7 +199,7 @@ class TrainingRun:
         self.state.step += 1
         self.state.seconds += seconds
         self.state.rays += result.rays
-        self.state.samples += result.samples
+        self.state.samples += result.colour_evaluations
         self.pace.add(seconds, result.rays, result.psnr)
 
     @property
@@ -352,7 +352,7 @@ class TrainingRun:
         name = f"nonfinite_{fault.step}.safetensors"
         (self.folder / name).write_bytes(save({key: tensor.contiguous() for key, tensor in fault.batch.items()}))
         self.log.event("nonfinite", fault.step, quantity=fault.quantity, batch=name)
-        advice = "Check the cameras, which give the rays" if fault.quantity == RAYS else slower
+        advice = "Check the cameras, which give the rays" if fault.quantity == RAY_GEOMETRY else slower
         return f"{advice}; the batch is kept in {self.folder / name}."
 
     def _on_training_photos(self) -> ProbeResult:

@@ -34,7 +34,12 @@ def observed(take: Callable[[], StepResult], step: int, timings: dict[str, Any],
         result = take()
     seconds = time.perf_counter() - started
     cores = workers() if device.type == "cpu" else 1
-    amounts = {"steps": 1, "rays": result.rays, "samples": result.samples, "densities": result.densities}
+    amounts = {
+        "steps": 1,
+        "rays": result.rays,
+        "samples": result.colour_evaluations,
+        "densities": result.density_evaluations,
+    }
     for name, amount in (amounts | {"seconds": seconds, "core_seconds": cores * seconds}).items():
         timings[name] = timings.get(name, 0) + amount
     parts = timings.setdefault("parts", {})

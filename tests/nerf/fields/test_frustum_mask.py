@@ -30,7 +30,7 @@ FIELD = HashGridSettings(
     occupancy_resolution=16,
     contracted=True,
 )
-TRAINER = HashGridTrainerSettings(seed=3, background=(0.0, 0.0, 0.0), samples=1024, least_photos=3)
+TRAINER = HashGridTrainerSettings(seed=3, background=(0.0, 0.0, 0.0), target_samples=1024, min_photos=3)
 
 
 def dataset(count: int = 4, half: float = HALF) -> RayDataset:
@@ -155,5 +155,5 @@ def test_nothing_is_ever_sampled_elsewhere_nor_found_there() -> None:
 )
 def test_where_the_rule_says_nothing_all_of_space_is_used(views: RayDataset, contracted: bool, least: int) -> None:
     field = HashGridField(replace(FIELD, contracted=contracted), 0, reference)
-    HashGridTrainer(field, views, replace(TRAINER, least_photos=least))
+    HashGridTrainer(field, views, replace(TRAINER, min_photos=least))
     assert (field.occupancy_bits == -1).all()

@@ -27,7 +27,7 @@ FIELD = HashGridSettings(
     num_levels=2, log2_hashmap_size=10, base_res=4, max_res=16, diagonal_steps=32, occupancy_resolution=16
 )
 BACKGROUND = (0.2, 0.9, 0.5)
-TRAINER = HashGridTrainerSettings(seed=3, background="random", samples=1024)
+TRAINER = HashGridTrainerSettings(seed=3, background="random", target_samples=1024)
 
 
 def small_dataset(size: int = 12) -> RayDataset:
@@ -81,7 +81,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit() -> None:
 
 
 def test_results_do_not_depend_on_the_number_of_threads() -> None:
-    settings = replace(TRAINER, samples=3 << 12)
+    settings = replace(TRAINER, target_samples=3 << 12)
     threads, states = torch.get_num_threads(), []
     try:
         for count in (1, 2, 3):
@@ -96,22 +96,24 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 
 
 def test_the_gradient_of_a_batch_is_the_sum_over_its_chunks() -> None:
-    run = trainer(replace(TRAINER, samples=1 << 14, distortion=0.1, depth_loss=0.2, chunks=4))
+    run = trainer(replace(TRAINER, target_samples=1 << 14, distortion_weight=0.1, depth_weight=0.2, micro_batches=4))
     run.dataset = run.dataset.with_sparse_depths(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
-    rays = run._rays_per_chunk()
-    parts = [run._part(0, 0.25, rays, chunk) for chunk in range(4)]
-    assert sum(int((part.batch.distance > 0).sum()) for part in parts) == 4 * rays // 8
+    rays = run._rays_per_micro_batch()
+    parts = [run._compute_micro_batch(0, 0.25, rays, chunk) for chunk in range(4)]
+    assert sum(int((part.batch.sparse_depth > 0).sum()) for part in parts) == 4 * rays // 8
     assert rays > 10 and not torch.equal(parts[0].batch.target, parts[1].batch.target)
     whole = HashGridBatch(
         Rays(*(torch.cat(part) for part in zip(*(part.batch.rays for part in parts), strict=True))),
         *(torch.cat(part) for part in zip(*(part.batch[1:] for part in parts), strict=True)),
     )
-    done = run.model.forward(whole.rays, whole.jitter, whole.offset, whole.background)
+    done = run.model.forward(whole.rays, whole.jitter, whole.thinning_offset, whole.background)
     loss = run._loss(4 * rays, 0.25, done, whole)
     gradients = run.model.backward(done, loss.grad, loss.grad_weights)
-    summed = [torch.stack(of_parts).sum(0) for of_parts in zip(*(part.weights for part in parts), strict=True)]
+    summed = [torch.stack(of_parts).sum(0) for of_parts in zip(*(part.grad_networks for part in parts), strict=True)]
     torch.testing.assert_close(summed, list(gradients.weights), rtol=1e-4, atol=1e-9)
-    torch.testing.assert_close(torch.cat([part.features for part in parts]), gradients.features, rtol=1e-4, atol=1e-9)
+    torch.testing.assert_close(
+        torch.cat([part.grad_features for part in parts]), gradients.features, rtol=1e-4, atol=1e-9
+    )
     torch.testing.assert_close(sum(part.loss for part in parts), loss.value)
 
 
@@ -119,7 +121,12 @@ def test_rays_adapt_to_the_samples_they_need() -> None:
     run = trainer()
     results = [run.step(step, 0.5) for step in range(100)]
     assert results[0].rays == 1024 // 128
-    assert results[0].rays < results[0].samples <= results[0].densities <= results[0].rays * FIELD.stepping.max_samples
+    assert (
+        results[0].rays
+        < results[0].colour_evaluations
+        <= results[0].density_evaluations
+        <= results[0].rays * FIELD.stepping.max_samples
+    )
     needed = results[-1].rays * float(run.samples_per_ray)
     assert 0.7 * 1024 < needed < 1.4 * 1024
     assert results[-1].rays > 5 * results[0].rays
@@ -173,7 +180,7 @@ def test_the_rate_scale_scales_the_update() -> None:
 
 
 def test_the_distortion_loss_is_added_and_has_its_gradient() -> None:
-    plain, with_it = trainer(), trainer(replace(TRAINER, distortion=1.0))
+    plain, with_it = trainer(), trainer(replace(TRAINER, distortion_weight=1.0))
     one, other = plain.step(0, 1.0), with_it.step(0, 1.0)
     assert one.psnr == other.psnr
     assert one.loss < other.loss < one.loss + 5
@@ -182,7 +189,9 @@ def test_the_distortion_loss_is_added_and_has_its_gradient() -> None:
 
 
 def test_the_distortion_loss_begins_weak() -> None:
-    losses = [trainer(replace(TRAINER, distortion=1.0)).step(0, share).loss for share in (0.0, 0.05, 0.15, 0.3, 1.0)]
+    losses = [
+        trainer(replace(TRAINER, distortion_weight=1.0)).step(0, share).loss for share in (0.0, 0.05, 0.15, 0.3, 1.0)
+    ]
     bare = trainer().step(0, 0.0).loss
     added = [(loss - bare) / (losses[-1] - bare) for loss in losses]
     assert added == pytest.approx([0.25, 0.25, 0.5, 1, 1], rel=1e-4)
@@ -190,7 +199,7 @@ def test_the_distortion_loss_begins_weak() -> None:
 
 def test_unbounded_scenes_train_too() -> None:
     run = trainer(
-        replace(TRAINER, background=(0.0, 0.0, 0.0), distortion=1e-3),
+        replace(TRAINER, background=(0.0, 0.0, 0.0), distortion_weight=1e-3),
         replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1),
     )
     results = [run.step(step, step / 60) for step in range(60)]
@@ -254,14 +263,14 @@ def test_the_gradient_of_poses_is_that_of_the_loss(seed: int) -> None:
     run = HashGridTrainer(HashGridField(FIELD, seed, reference), small_dataset(), settings, ImageEffects((poses,)))
     for step in range(60):
         run.step(step, 0.84)  # at a third of the rate
-    by_hand = run._part(7, 0.5, 128, 0).effects
+    by_hand = run._compute_micro_batch(7, 0.5, 128, 0).grad_effects
     assert set(by_hand) == {"pose_refinement.turn", "pose_refinement.offset"}
 
     def difference(part: Tensor, view: int, axis: int) -> float:
         losses = []
         for sign in (1, -1):
             part[view, axis] += sign * 2e-3
-            losses.append(float(run._part(7, 0.5, 128, 0).loss))
+            losses.append(float(run._compute_micro_batch(7, 0.5, 128, 0).loss))
             part[view, axis] -= sign * 2e-3
         return (losses[0] - losses[1]) / 4e-3
 
@@ -310,7 +319,7 @@ def test_the_sky_becomes_what_is_seen_in_its_direction() -> None:
     dataset = dataset._replace(pixels=colours.repeat_interleave(len(dataset.pixels) // 2, 0))
     outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1, background_model=True)
     run = HashGridTrainer(
-        HashGridField(outdoors, 0, reference), dataset, replace(TRAINER, background=(0.0, 0.0, 0.0), rate=1e-2)
+        HashGridField(outdoors, 0, reference), dataset, replace(TRAINER, background=(0.0, 0.0, 0.0), learning_rate=1e-2)
     )
     for step in range(20):
         run.step(step, step / 20)
@@ -327,7 +336,7 @@ def test_known_distances_decide_a_shape_that_colours_leave_open() -> None:
     dataset = small_dataset()
     grey = dataset._replace(pixels=torch.full_like(dataset.pixels[:, :3], 128))
     guided = grey.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
-    settings = replace(TRAINER, background=(0.0, 0.0, 0.0), depth_loss=0.1)
+    settings = replace(TRAINER, background=(0.0, 0.0, 0.0), depth_weight=0.1)
     centre, depth = grey.lookup(torch.tensor([78])).rays, {}
     for name, photos in {"open": grey, "guided": guided}.items():
         run = HashGridTrainer(HashGridField(FIELD, 0, reference), photos, settings)
@@ -338,7 +347,7 @@ def test_known_distances_decide_a_shape_that_colours_leave_open() -> None:
 
 
 def test_points_guide_a_run_less_and_less() -> None:
-    settings = replace(TRAINER, depth_loss=0.1)
+    settings = replace(TRAINER, depth_weight=0.1)
     plain, guided = trainer(settings), trainer(settings)
     guided.dataset = guided.dataset.with_sparse_depths(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
     assert depth_loss_multiplier(0.0) == 1 and depth_loss_multiplier(0.25) == 0.75 and depth_loss_multiplier(1.0) == 0
@@ -350,10 +359,10 @@ def test_points_guide_a_run_less_and_less() -> None:
 
 
 def test_the_depth_loss_fades_in_value_and_gradient() -> None:
-    run = trainer(replace(TRAINER, depth_loss=0.1))
+    run = trainer(replace(TRAINER, depth_weight=0.1))
     run.dataset = run.dataset.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
     batch = run._batch(0, 0.0, 0, 64)
-    done = run.model.forward(batch.rays, batch.jitter, batch.offset, batch.background)
+    done = run.model.forward(batch.rays, batch.jitter, batch.thinning_offset, batch.background)
     early, late, over = (run._loss(64, share, done, batch) for share in (0.25, 0.75, 1.0))
     of_depth = [float(loss.value - over.value) for loss in (early, late)]
     assert of_depth[0] == pytest.approx(3 * of_depth[1]) and of_depth[1] > 0
@@ -365,10 +374,10 @@ def test_the_depth_loss_fades_in_value_and_gradient() -> None:
 
 
 def test_however_many_the_chunks_an_eighth_of_the_rays_run_to_points() -> None:
-    run = trainer(replace(TRAINER, depth_loss=0.1))
+    run = trainer(replace(TRAINER, depth_weight=0.1))
     run.dataset = run.dataset.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
     for count in (1, 3, 5, 8, 21):
-        to_points = [int((run._batch(0, 0.1, chunk, count).distance > 0).sum()) for chunk in range(32)]
+        to_points = [int((run._batch(0, 0.1, chunk, count).sparse_depth > 0).sum()) for chunk in range(32)]
         assert sum(to_points) == 32 * count // 8 and max(to_points) - min(to_points) <= 1
 
 

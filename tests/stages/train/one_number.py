@@ -42,7 +42,7 @@ class OneNumber:
         self.trouble(step, lr_scale)
         self.history.append((step, progress, lr_scale))
         self.value = self.value * 0.9 + lr_scale * (1 - progress) * torch.sin(torch.tensor(float(step)))
-        return StepResult(float(self.value), 20.0, rays=4, samples=12, densities=20)
+        return StepResult(float(self.value), 20.0, rays=4, colour_evaluations=12, density_evaluations=20)
 
     def state(self) -> dict[str, Tensor]:
         return {"value": self.value}

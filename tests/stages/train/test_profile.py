@@ -48,7 +48,7 @@ def trainer(kind: str) -> HashGridTrainer | VanillaTrainer:
             VanillaNerf(VanillaSettings(**PAPER), 0), dataset(), VanillaTrainerSettings(32, 0, "random")
         )
     backend = load_backend("warp" if kind == "warp" else "torch", "cpu")
-    settings = HashGridTrainerSettings(0, "random", samples=512, chunks=2, distortion=1e-3)
+    settings = HashGridTrainerSettings(0, "random", target_samples=512, micro_batches=2, distortion_weight=1e-3)
     return HashGridTrainer(
         HashGridField(HashGridSettings(2, 4, 10, 8, 16, occupancy_resolution=16), 0, backend), dataset(), settings
     )
