@@ -14,7 +14,7 @@ PARTS = {
     "backward": ("#e11d48", "backward pass"),
     "scatter": ("#eab308", "gradients added to the grids"),
     "optimiser": ("#a16207", "Adam"),
-    "cache": ("#14b8a6", "update of the occupancy grid"),
+    "occupancy": ("#14b8a6", "update of the occupancy grid"),
     "rest": ("#94a3b8", "everything between these parts"),
     "waiting": ("transparent", "cores waiting for each other, or for other programs"),
 }

@@ -165,7 +165,15 @@ def test_a_non_finite_step_changes_nothing_and_shows_its_batch(
         run.step(1, 0.5)
     for name, tensor in run.state().items():
         torch.testing.assert_close(tensor, before[name], rtol=0, atol=0, equal_nan=True)
-    assert set(caught.value.batch) == {*Rays._fields, "target", "background", "jitter", "offset", "view", "distance"}
+    assert set(caught.value.batch) == {
+        *Rays._fields,
+        "target",
+        "background",
+        "jitter",
+        "thinning_offset",
+        "view",
+        "sparse_depth",
+    }
 
 
 def test_the_rate_scale_scales_the_update() -> None:

@@ -37,7 +37,7 @@ def part_without_effects(run: HashGridTrainer, step: int, progress: float, rays:
 
 def test_effects_that_are_off_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     off, without = trainer(), trainer()
-    monkeypatch.setattr(without, "_part", partial(part_without_effects, without))
+    monkeypatch.setattr(without, "_compute_micro_batch", partial(part_without_effects, without))
     for step in range(30):
         assert off.step(step, step / 30) == without.step(step, step / 30)
     assert same(off.state(), without.state())

@@ -28,7 +28,7 @@ from tests.small_scenes import pinhole_directions
 
 CPU = torch.device("cpu")
 RATES = Rates(1e10, 1e8, 1e10)
-GRID_PARTS = {"batch", "march", "gather", "encode", "mlp", "composite", "backward", "scatter", "optimiser", "cache"}
+GRID_PARTS = {"batch", "march", "gather", "encode", "mlp", "composite", "backward", "scatter", "optimiser", "occupancy"}
 PAPER_PARTS = {"batch", "sampling", "encode", "mlp", "composite", "backward", "optimiser"}
 PAPER: dict[str, Any] = {"depth": 3, "width": 16, "skip": 1, "samples_coarse": 8, "samples_fine": 8}
 COUNTED: dict[str, Any] = {"steps": 1, "rays": 8, "samples": 80, "densities": 200, "seconds": 1.0, "core_seconds": 1.0}
