@@ -22,11 +22,11 @@ import torch
 from nerf.fields.hash_grid import HashGridField
 from nerf.geometry.scene import Scene
 from nerf.training import hash_grid_trainer
+from nerf.training.evaluation_pixels import EvaluationPixels, evaluate, sample_evaluation_pixels
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.schedule import schedule_of
 from nerf.training.trainer import FieldTrainer
-from nerf.training.validation_probe import Probe, make_probe, measure
 from stages.effects.decisions import Decisions, image_effects, read_decisions, told_by_neighbours
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.hardware.device import compute_device
@@ -64,7 +64,7 @@ class Bench(NamedTuple):
     scene: Scene
     decisions: Decisions
     dataset: RayDataset
-    probe: Probe
+    probe: EvaluationPixels
     neighbours: torch.Tensor
 
 
@@ -89,7 +89,7 @@ def bench_of(workspace: Path) -> Bench:
     train = guided_dataset(inputs, scene, downscale, Quiet())
     test = training_dataset(inputs["ingest"], scene, "test", downscale, Quiet())
     shown_over = torch.tensor(field_background(config, scene))
-    probe = make_probe(test, PROBE_RAYS, shown_over, seed=0)
+    probe = sample_evaluation_pixels(test, PROBE_RAYS, shown_over, seed=0)
     return Bench(config, scene, decisions, train, probe, told_by_neighbours(scene, scene.of_split("test")))
 
 
@@ -130,7 +130,7 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
         if step + 1 in due:
             as_expected = trainer.effects.of_held_out(bench.neighbours)
             models = {"heldout_psnr": trainer.model} | {name: mean.model for name, mean in means.items()}
-            psnr = {name: measure(model, bench.probe, as_expected).psnr for name, model in models.items()}
+            psnr = {name: evaluate(model, bench.probe, as_expected).psnr for name, model in models.items()}
             points.append({"step": step + 1, "train_psnr": pace, **psnr})
     return {"rays": rays, "pixels": bench.dataset.unmasked_count, "points": points}
 

@@ -165,7 +165,7 @@ class HashGridTrainer:
     def _frustum_mask(self) -> Bool[Tensor, "cells"] | None:
         """Only in contracted space and with sparse points, which tell where foregrounds begin; else None."""
         min_photos, stepping = min(self.settings.min_photos, len(self.dataset.near) - 1), self.model.stepping
-        if min_photos <= 1 or self.dataset.known is None or not stepping.contracted:
+        if min_photos <= 1 or self.dataset.sparse_pixels is None or not stepping.contracted:
             return None
         return compute_frustum_mask(self.dataset, min_photos, stepping.occupancy_resolution)
 
@@ -221,7 +221,7 @@ class HashGridTrainer:
         random = generator(device, self.settings.seed, step, index)
         # Counted over the whole step: a micro-batch alone may be too small for a single ray to a sparse point.
         first, end = (self._photo_ray_count(number * count, progress) for number in (index, index + 1))
-        pixel = self.dataset.nth(self.pixel_sampler.take(int(self.pixels_sampled) + first, end - first))
+        pixel = self.dataset.unmasked_pixels(self.pixel_sampler.take(int(self.pixels_sampled) + first, end - first))
         sparse_count, sparse_depth = count - len(pixel), torch.zeros(count, device=device)
         if sparse_count:
             sparse_pixels, sparse_depth[-sparse_count:] = self.dataset.sample_sparse_depths(sparse_count, random)
@@ -240,7 +240,9 @@ class HashGridTrainer:
         return rays - rays // DEPTH_RAY_INTERVAL if self._has_depth_loss(progress) else rays
 
     def _has_depth_loss(self, progress: float) -> bool:
-        return self.dataset.known is not None and self.settings.depth_weight * depth_loss_multiplier(progress) > 0
+        return (
+            self.dataset.sparse_pixels is not None and self.settings.depth_weight * depth_loss_multiplier(progress) > 0
+        )
 
     def _compute_micro_batch(self, step: int, progress: float, rays: int, index: int) -> _MicroBatch:
         """What micro-batch number ``index``, of so many rays, adds to loss and gradients."""

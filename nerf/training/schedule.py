@@ -13,7 +13,7 @@ Reason = Literal["begin", "clock", "target", "more"]
 
 # A run towards a target that stops early does so as every run ends: with the last quarter of its steps, at the shares
 # of that.
-CLOSING_SHARE = 0.75
+DECAY_START_PROGRESS = 0.75
 
 
 class ScheduleRevision(NamedTuple):
@@ -29,17 +29,17 @@ class ScheduleRevision(NamedTuple):
 class StepSchedule(NamedTuple):
     """The decisions so far, in order; the last one holds."""
 
-    decisions: tuple[ScheduleRevision, ...]
+    revisions: tuple[ScheduleRevision, ...]
 
     @property
     def total_steps(self) -> int:
         """How many steps the run has, by the latest decision."""
-        return self.decisions[-1].total_steps
+        return self.revisions[-1].total_steps
 
     @property
-    def is_whole(self) -> bool:
+    def is_single_cycle(self) -> bool:
         """Whether the progress never fell to go on from an end: that of another run, or one short of a target."""
-        return all(decision.reason != "more" for decision in self.decisions)
+        return all(decision.reason != "more" for decision in self.revisions)
 
     def progress(self, step: int) -> float:
         """The progress of the run before ``step``, 1 at the end.
@@ -47,7 +47,7 @@ class StepSchedule(NamedTuple):
         Every decision spreads the progress that was left when it was made evenly over the steps that were left.
         """
         start, total, progress, _ = next(
-            decision for decision in reversed(self.decisions) if decision.from_step <= step
+            decision for decision in reversed(self.revisions) if decision.from_step <= step
         )
         return progress if total == start else progress + (1 - progress) * min(1.0, (step - start) / (total - start))
 
@@ -56,30 +56,30 @@ class StepSchedule(NamedTuple):
 
         Raises ValueError where that would leave no step to take, or rewrite a decision already made.
         """
-        if not self.decisions[-1].from_step <= step < total_steps:
+        if not self.revisions[-1].from_step <= step < total_steps:
             raise ValueError(f"at step {step} the plan {self.decisions} cannot become {total_steps} steps")
-        return StepSchedule((*self.decisions, ScheduleRevision(step, total_steps, progress, "clock")))
+        return StepSchedule((*self.revisions, ScheduleRevision(step, total_steps, progress, "clock")))
 
     def until(self, step: int) -> "StepSchedule":
         """The decisions made up to ``step``: later ones are about steps that are to be taken once more."""
-        return StepSchedule(tuple(decision for decision in self.decisions if decision.from_step <= step))
+        return StepSchedule(tuple(decision for decision in self.revisions if decision.from_step <= step))
 
-    def closing(self, step: int) -> "StepSchedule":
+    def with_decay_from(self, step: int) -> "StepSchedule":
         """This plan with ``step`` as the first one of the last quarter of a run, or of what is left if that is less.
         Raises ValueError where that rewrites a decision or leaves no step."""
-        if not self.decisions[-1].from_step <= step < self.total_steps:
+        if not self.revisions[-1].from_step <= step < self.total_steps:
             raise ValueError(f"the plan {self.decisions} cannot close at step {step}")
-        total = min(self.total_steps, max(step + 1, round(step / CLOSING_SHARE)))
-        progress = max(CLOSING_SHARE, self.progress(step))
-        return StepSchedule((*self.decisions, ScheduleRevision(step, total, progress, "target")))
+        total = min(self.total_steps, max(step + 1, round(step / DECAY_START_PROGRESS)))
+        progress = max(DECAY_START_PROGRESS, self.progress(step))
+        return StepSchedule((*self.revisions, ScheduleRevision(step, total, progress, "target")))
 
-    def ended(self, step: int) -> "StepSchedule":
+    def ended_at(self, step: int) -> "StepSchedule":
         """This plan without the steps from ``step`` on. Raises ValueError where that rewrites a decision."""
-        if not self.decisions[-1].from_step < step <= self.total_steps:
+        if not self.revisions[-1].from_step < step <= self.total_steps:
             raise ValueError(f"the plan {self.decisions} cannot end at step {step}")
-        return StepSchedule((*self.decisions, ScheduleRevision(step, step, self.progress(step), "target")))
+        return StepSchedule((*self.revisions, ScheduleRevision(step, step, self.progress(step), "target")))
 
-    def extended(self, total_steps: int) -> "StepSchedule":
+    def extended_to(self, total_steps: int) -> "StepSchedule":
         """This plan, once it is at its end, with more steps: its progress falls to that of a run of ``total_steps``.
 
         Raises ValueError where that would add no step.
@@ -87,10 +87,10 @@ class StepSchedule(NamedTuple):
         done = self.total_steps
         if total_steps <= done:
             raise ValueError(f"after {done} steps the run cannot go on to {total_steps}")
-        return StepSchedule((*self.decisions, ScheduleRevision(done, total_steps, done / total_steps, "more")))
+        return StepSchedule((*self.revisions, ScheduleRevision(done, total_steps, done / total_steps, "more")))
 
 
-def schedule_of(total_steps: int) -> StepSchedule:
+def new_schedule(total_steps: int) -> StepSchedule:
     """The plan of a run of ``total_steps`` steps. Raises ValueError below one step."""
     if total_steps < 1:
         raise ValueError(f"a run needs at least one step, not {total_steps}")
@@ -102,7 +102,7 @@ def steps_that_fit(step: int, seconds_left: float, steps_per_second: float) -> i
     return step + max(1, round(seconds_left * steps_per_second))
 
 
-def replanned(
+def revised_by_clock(
     plan: StepSchedule, step: int, seconds: float, budget: float, steps_per_second: float, tolerance: float
 ) -> StepSchedule:
     """The plan before ``step``, ``seconds`` of the ``budget`` being used; revised only if it would end more than

@@ -177,7 +177,9 @@ class VanillaTrainer:
     def _batch(self, step: int) -> Batch:
         random = generator(self.dataset.device, self.settings.seed, step)
         count = self.settings.batch_rays
-        rays, colour, alpha, view = self.dataset.lookup(self.dataset.nth(self.order.take(step * count, count)))
+        rays, colour, alpha, view = self.dataset.lookup(
+            self.dataset.unmasked_pixels(self.order.take(step * count, count))
+        )
         if self.settings.background == "random":
             background = torch.rand(3, generator=random, device=self.dataset.device)
         else:

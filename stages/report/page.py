@@ -32,7 +32,7 @@ from stages.report.cameras import (
 )
 from stages.report.effects import effects_table
 from stages.report.plots import ORDER_COLOURS, camera_svgs, curve_svg
-from stages.report.profile import parts_bar
+from stages.report.profile import profile_bar
 from stages.tradeoff.plots import COLUMNS, plot_svg, rendering_sentence, table_cells
 from stages.train.curve import coming_doubling, doubling_words, knee_words, more_option, ssim_words
 
@@ -59,7 +59,7 @@ class Results:
     effects: dict[str, Any] | None
     field: dict[str, Any] | None
     curve: dict[str, Any] | None
-    parts: dict[str, Any] | None
+    profile: dict[str, Any] | None
     metrics: dict[str, Any] | None
     study: dict[str, Any] | None
 
@@ -80,7 +80,7 @@ def read_results(inputs: Inputs, stages: Sequence[str]) -> Results:
         effects=of("effects", "effects.json"),
         field=of("train", "field.json"),
         curve=of("train", "curve.json"),
-        parts=of("train", "profile.json")
+        profile=of("train", "profile.json")
         if "train" in inputs and (inputs["train"] / "profile.json").exists()
         else None,
         metrics=of("evaluate", "metrics.json"),
@@ -104,7 +104,7 @@ def summarise(results: Results) -> dict[str, Any]:
         "total_seconds": round(train.get("earlier_seconds", 0.0) + sum(m["seconds"] for m in manifests.values()), 3),
         "stage_seconds": {stage: manifest["seconds"] for stage, manifest in manifests.items()},
         "expected_seconds": _expected(manifests),
-        "training_parts": results.parts,
+        "training_profile": results.profile,
         **{key: metrics.get(key) for key in ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")},
         "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
         "verdict": metrics.get("verdict", "Not measured: stage evaluate has not run."),
@@ -145,7 +145,7 @@ def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
         **_cameras_part(results, names),
         effects=effects_table(results.effects),
         curve=_curve(results),
-        parts=parts_bar(results.parts),
+        profile=profile_bar(results.profile),
         metrics=results.metrics,
         compared=_compared(results),
         video=_video(results.inputs, config.video_limit_mb),

@@ -10,7 +10,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from nerf.training.learning_curve import KNEE_DB, Gain, knee, last_doubling, next_doubling, quality_at
+from nerf.training.learning_curve import (
+    MIN_DOUBLING_GAIN_DB,
+    PredictedGain,
+    diminishing_returns_seconds,
+    last_doubling_gain,
+    predicted_doubling_gain,
+    quality_at,
+)
 from stages.amounts import duration, duration_option
 from stages.hardware.device import compute_device, cores
 from stages.io.files import write_json
@@ -31,17 +38,21 @@ def heldout_curve(points: Sequence[dict[str, Any]]) -> list[tuple[float, float]]
     return [(seconds, psnr) for seconds, psnr in known if psnr is not None and seconds > 0]
 
 
-def coming_doubling(field: str, whole: bool, points: Sequence[dict[str, Any]]) -> Gain | None:
+def coming_doubling(field: str, whole: bool, points: Sequence[dict[str, Any]]) -> PredictedGain | None:
     """What the next doubling of the time is predicted to buy at the same sizes of photos and field, as ``--more`` keeps
     them; None where the curve is too short, and for what the prediction was not fitted to: the paper's field, whose
     rate falls all the way, and a run that is not ``whole``, where half of the time may have ended annealed, too."""
-    return next_doubling(heldout_curve(points), points[-1]["step"]) if points and field == "grid" and whole else None
+    return (
+        predicted_doubling_gain(heldout_curve(points), points[-1]["step"])
+        if points and field == "grid" and whole
+        else None
+    )
 
 
-def doubling_words(points: Sequence[dict[str, Any]], coming: Gain | None) -> str | None:
+def doubling_words(points: Sequence[dict[str, Any]], coming: PredictedGain | None) -> str | None:
     """What the last doubling of the time bought and what is ``coming``; None where the curve is too short."""
     curve = heldout_curve(points)
-    last = last_doubling(curve)
+    last = last_doubling_gain(curve)
     if last is None:
         return None
     words = (
@@ -54,7 +65,7 @@ def doubling_words(points: Sequence[dict[str, Any]], coming: Gain | None) -> str
     return f"{words}; {again} is predicted to buy {coming.db:+z.1f} dB (± {coming.half_width:.1f})"
 
 
-def next_words(points: Sequence[dict[str, Any]], coming: Gain | None) -> str | None:
+def next_words(points: Sequence[dict[str, Any]], coming: PredictedGain | None) -> str | None:
     """:func:`doubling_words` for a line that has no room."""
     gain = coming and f"{coming.db:+z.1f} ± {coming.half_width:.1f} dB"
     return gain and f"as long again ({more_option(points)}) is predicted to buy {gain}"
@@ -77,12 +88,12 @@ def target_words(target: float | None, reached: float | None, seconds: float) ->
 def knee_words(points: Sequence[dict[str, Any]]) -> str | None:
     """Where the knee is, or that there is none; None where the curve is too short to tell."""
     curve = heldout_curve(points)
-    if last_doubling(curve) is None:
+    if last_doubling_gain(curve) is None:
         return None
-    at = knee(curve)
+    at = diminishing_returns_seconds(curve)
     if at is None:
-        return f"no knee yet: the last doubling bought more than {KNEE_DB:g} dB"
-    return f"the knee is at {duration(at)}: from there on a doubling bought less than {KNEE_DB:g} dB"
+        return f"no knee yet: the last doubling bought more than {MIN_DOUBLING_GAIN_DB:g} dB"
+    return f"the knee is at {duration(at)}: from there on a doubling bought less than {MIN_DOUBLING_GAIN_DB:g} dB"
 
 
 def ssim_words(points: Sequence[dict[str, Any]]) -> str | None:

@@ -72,7 +72,7 @@ def training_dataset(ingest: Path, scene: "Scene", split: "Split", downscale: fl
         sizes=[(photo.height, photo.width) for photo in store.photos],
         camera_of=[used.index(view.camera) for view in views],
         camera_directions=[directions(index) for index in range(len(used))],
-        placement=PosedViews(
+        posed_views=PosedViews(
             poses=torch.tensor(np.stack([view.scene_from_camera for view in views]), dtype=torch.float32),
             near=torch.tensor([view.near for view in views]),
             far=torch.tensor([view.far for view in views]),
@@ -114,7 +114,7 @@ def _ignored(
 
 def _masked(dataset: RayDataset, ignored: "Iterable[Tensor | None]", split: "Split", progress: Progress) -> RayDataset:
     try:
-        dataset = dataset.without(ignored)
+        dataset = dataset.with_masks(ignored)
     except ValueError as error:
         why = f"{error} of the {split} photos at this size"
         raise StageError(ALL_MASKED, "nothing is left to train on", why, "Give a smaller --train.downscale.") from error

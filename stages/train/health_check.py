@@ -4,8 +4,8 @@ A field is examined in full after the warm-up and at the end. In between the PSN
 tells when to look: whenever it has come near that of a flat colour, before a checkpoint replaces an older one.
 """
 
+from nerf.training.evaluation_pixels import EvaluationPixels, evaluate
 from nerf.training.trainer import FieldTrainer
-from nerf.training.validation_probe import Probe, measure
 
 EMPTY_OPACITY = 1e-3  # a field whose mean opacity is below this shows nothing but background or sky
 SUSPICIOUS_DB = 3.0  # above a flat colour: batches that are no better may come from a field that is lost
@@ -15,12 +15,12 @@ class Lost(Exception):
     """The field in training is useless: not finite, empty or flat, as the text says. Training goes back or restarts."""
 
 
-def symptom_of(trainer: FieldTrainer, probe: Probe) -> str | None:
+def symptom_of(trainer: FieldTrainer, probe: EvaluationPixels) -> str | None:
     """What is wrong with the field as the training photos see it, or None."""
     if name := not_finite(trainer):
         return f"its {name} is not finite"
     try:
-        seen = measure(trainer.model, probe, trainer.effects)
+        seen = evaluate(trainer.model, probe, trainer.effects)
     except ValueError as error:  # of PSNR, which has no value there
         return f"it shows what is no number: {error}"
     if not seen.opacity >= EMPTY_OPACITY:  # nor is what is no number
@@ -30,7 +30,7 @@ def symptom_of(trainer: FieldTrainer, probe: Probe) -> str | None:
     return None
 
 
-def is_suspicious(batch_psnr: float, probe: Probe) -> bool:
+def is_suspicious(batch_psnr: float, probe: EvaluationPixels) -> bool:
     """Whether batches as bad as this ask for :func:`symptom_of`."""
     return not batch_psnr > probe.mean_colour_psnr + SUSPICIOUS_DB
 

@@ -22,9 +22,16 @@ from pathlib import Path
 
 from safetensors.torch import save
 
-from nerf.training.schedule import CLOSING_SHARE, ScheduleRevision, StepSchedule, next_in_series, replanned, schedule_of
+from nerf.training.evaluation_pixels import PixelEvaluation, evaluate
+from nerf.training.schedule import (
+    DECAY_START_PROGRESS,
+    ScheduleRevision,
+    StepSchedule,
+    new_schedule,
+    next_in_series,
+    revised_by_clock,
+)
 from nerf.training.trainer import RAY_GEOMETRY, FieldTrainer, NonFinite
-from nerf.training.validation_probe import ProbeResult, measure
 from stages.amounts import short_count
 from stages.contract import Progress, StageError
 from stages.io.files import read_json, write_durably
@@ -32,7 +39,7 @@ from stages.io.live_line import live_line
 from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from stages.train.health_check import Lost, is_suspicious, not_finite, symptom_of
 from stages.train.more import cannot_go_on
-from stages.train.profile import observed
+from stages.train.profile import profiled_step
 from stages.train.state import Pace, Probes, RunState, TrainingBudget, TrainingLog, checkpoint_interval, lost_seconds
 from stages.train.validation_images import Target, load_metrics, look
 
@@ -104,7 +111,7 @@ class TrainingRun:
         self.trainer: FieldTrainer = self.make_trainer(state.restarts)
         self.lost = lost_seconds(self.spent, state)
         steps, self.clock_budget = self._limits()
-        self.plan: StepSchedule = schedule_of(steps or PROVISIONAL_STEPS)
+        self.plan: StepSchedule = new_schedule(steps or PROVISIONAL_STEPS)
         self._plan_measurement()
         self._write_journal()
         self._save()
@@ -130,7 +137,7 @@ class TrainingRun:
         if steps is None:
             assert self.budget.seconds is not None, "one of the two is given"
             steps = step + max(1, round(self.budget.seconds * step / seconds))
-        self.plan = self.plan.extended(steps)
+        self.plan = self.plan.extended_to(steps)
         self._write_journal()
         self._save()
         self.log.event("extended", step, total_steps=self.plan.total_steps)
@@ -194,7 +201,7 @@ class TrainingRun:
         started = time.perf_counter()
         share, scale = self.plan.progress(self.state.step), 0.5**self.state.rollbacks
         take = partial(self.trainer.step, self.state.step, share, scale)
-        result = observed(take, self.state.step, self.state.timings, self.probes.train.colours.device)
+        result = profiled_step(take, self.state.step, self.state.timings, self.probes.train.colours.device)
         seconds = time.perf_counter() - started
         self.state.step += 1
         self.state.seconds += seconds
@@ -213,10 +220,10 @@ class TrainingRun:
         step, tolerance = self.state.step, PLAN_SHARE * (budget - self.state.seconds_before)
         self.next_planning = self.state.seconds + tolerance
         self.spent.write_text(f"{self.state.seconds + self.lost:.3f}")
-        last = self.plan.decisions[-1]
+        last = self.plan.revisions[-1]
         if not last.from_step <= step < self.plan.total_steps or last.reason == "target":
             return
-        plan = replanned(self.plan, step, self.state.seconds, budget, 1 / self.pace.seconds_per_step, tolerance)
+        plan = revised_by_clock(self.plan, step, self.state.seconds, budget, 1 / self.pace.seconds_per_step, tolerance)
         if plan is not self.plan:
             self.plan = plan
             self._write_journal()
@@ -254,22 +261,22 @@ class TrainingRun:
     def _steer(self, target: Target) -> None:
         """Stop where the validation photos are as good as wanted; anneal where that may be all it takes; go on as
         before where it was not enough and there is time. Decisions already in the plan are not made again."""
-        step, decided = self.state.step, self.plan.decisions[-1]
+        step, decided = self.state.step, self.plan.revisions[-1]
         self.state.validation_psnr = round(look(self.trainer, target.photos).psnr, 3)
         self.log.event("validated", step, psnr=self.state.validation_psnr)
         if step <= decided.from_step or self.state.open_target(target.psnr) is None:
             return
-        own = (decision for decision in self.plan.decisions if decision.from_step > self.state.steps_before)
+        own = (decision for decision in self.plan.revisions if decision.from_step > self.state.steps_before)
         failed = sum(decision.reason == "target" for decision in own)
         missing = target.psnr - self.state.validation_psnr
         plan = self.plan
         if missing <= 0:
-            plan = plan.ended(step)
+            plan = plan.ended_at(step)
         elif step == plan.total_steps:
             if decided.reason == "target" and self._most_steps() > step:
-                plan = plan.extended(self._most_steps())
-        elif missing <= ANNEALING_DB / 2**failed and plan.progress(step) < CLOSING_SHARE:
-            plan = plan.closing(step)
+                plan = plan.extended_to(self._most_steps())
+        elif missing <= ANNEALING_DB / 2**failed and plan.progress(step) < DECAY_START_PROGRESS:
+            plan = plan.with_decay_from(step)
         if plan is not self.plan:
             self.plan = plan
             self._write_journal()
@@ -295,7 +302,7 @@ class TrainingRun:
         self.next_checkpoint = time.monotonic() + (self.checkpoint_seconds or checkpoint_interval(self.budget, cost))
 
     def _write_journal(self) -> None:
-        write_durably(self.journal, json.dumps(self.plan.decisions).encode())
+        write_durably(self.journal, json.dumps(self.plan.revisions).encode())
 
     def _examine(self) -> None:
         """Before the state is kept: raise Lost where it is not finite or, the warm-up being over, the field is dead."""
@@ -355,8 +362,8 @@ class TrainingRun:
         advice = "Check the cameras, which give the rays" if fault.quantity == RAY_GEOMETRY else slower
         return f"{advice}; the batch is kept in {self.folder / name}."
 
-    def _on_training_photos(self) -> ProbeResult:
-        return measure(self.trainer.model, self.probes.train, self.trainer.effects)
+    def _on_training_photos(self) -> PixelEvaluation:
+        return evaluate(self.trainer.model, self.probes.train, self.trainer.effects)
 
     def _restart(self, symptom: str) -> None:
         """Begin anew with another seed; give up by name after the second."""
@@ -409,5 +416,5 @@ def reached_before_words(target_psnr: float) -> str:
 def steering_words(state: RunState, target_psnr: float, plan: StepSchedule) -> str:
     """That the rate falls before the end, or goes back up, with a target in mind."""
     seen = f"{state.validation_psnr:.1f} of {target_psnr:g} dB on photos set aside after {state.step:,} steps"
-    and_now = "annealing over" if plan.decisions[-1].reason == "target" else "going on for"
+    and_now = "annealing over" if plan.revisions[-1].reason == "target" else "going on for"
     return f"{seen}: {and_now} {plan.total_steps - state.step:,} more"

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from stages.contract import StageError
 
 if TYPE_CHECKING:
-    from nerf.training.validation_probe import Probe
     from stages.train.validation_images import Target, Unseen
 
 RATE_MEMORY_SECONDS = 5.0  # how far back the measured speed and the shown PSNR look

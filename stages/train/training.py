@@ -7,8 +7,8 @@ import torch
 
 from nerf.geometry.scene import Scene
 from nerf.runtime.matmul_precision import use_matmul_precision
+from nerf.training.evaluation_pixels import sample_evaluation_pixels
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.validation_probe import make_probe
 from stages.amounts import short_count
 from stages.contract import Inputs, Progress, StageResult
 from stages.effects.decisions import image_effects, learnt_of_photos, read_decisions
@@ -31,7 +31,7 @@ from stages.train.fields import field_of, make_trainer
 from stages.train.loop import TrainingRun
 from stages.train.more import budget_of, earlier_seconds
 from stages.train.precision import precision_facts, say_if_inexact
-from stages.train.profile import write_parts
+from stages.train.profile import write_profile
 from stages.train.state import Probes, TrainingBudget, TrainingLog
 from stages.train.validation_images import PROBE_RAYS, PROBE_SEED, Target, unseen_photos, with_validation
 
@@ -77,7 +77,7 @@ def prepare(config: Config, scene: Scene, inputs: Inputs, folder: Path, progress
     shown_over = torch.tensor(field_background(config, scene), device=device)
 
     probes = Probes(
-        make_probe(dataset, PROBE_RAYS, shown_over, PROBE_SEED),
+        sample_evaluation_pixels(dataset, PROBE_RAYS, shown_over, PROBE_SEED),
         unseen_photos(config, inputs["ingest"], scene, "test", device, progress),
     )
     if config.target_psnr is not None:
@@ -128,7 +128,7 @@ def save(training: Training, folder: Path, progress: Progress) -> StageResult:
     write_curve(folder, config.kind, config.downscale, run.plan.is_whole, run.state.curve)
     progress.update("measuring what this machine can do")
     with use_matmul_precision(config.matmul):
-        parts = write_parts(folder, run.state.timings, config, run.probes.train.colours.device)
+        parts = write_profile(folder, run.state.timings, config, run.probes.train.colours.device)
     for words in _closing_notes(training):
         progress.note(words)
     left_behind = sorted(path.name for path in folder.glob("nonfinite_*.safetensors"))

@@ -8,8 +8,15 @@ import torch
 from torch import Tensor
 
 from nerf.geometry.scene import Scene, Split
+from nerf.training.evaluation_pixels import (
+    EvaluationPatches,
+    EvaluationPixels,
+    evaluate,
+    render_patches,
+    sample_evaluation_patches,
+    sample_evaluation_pixels,
+)
 from nerf.training.trainer import FieldTrainer
-from nerf.training.validation_probe import Patches, Probe, make_patches, make_probe, measure, pictures
 from stages.contract import Progress, StageError
 from stages.effects.decisions import told_by_neighbours
 from stages.evaluate.image_metrics import ssim
@@ -30,8 +37,8 @@ MAX_VALIDATION = 8  # where a target decides when to stop
 class Unseen(NamedTuple):
     """Pixels and patches of some photos, and how much each training photo tells of each of these."""
 
-    probe: Probe
-    patches: Patches
+    probe: EvaluationPixels
+    patches: EvaluationPatches
     neighbours: Tensor
 
 
@@ -66,8 +73,8 @@ def unseen_photos(
         return None
     shown_over = torch.tensor(field_background(config, scene), device=device)
     return Unseen(
-        make_probe(dataset, PROBE_RAYS, shown_over, PROBE_SEED),
-        make_patches(dataset, PATCHES, PATCH_SIDE, shown_over, PROBE_SEED),
+        sample_evaluation_pixels(dataset, PROBE_RAYS, shown_over, PROBE_SEED),
+        sample_evaluation_patches(dataset, PATCHES, PATCH_SIDE, shown_over, PROBE_SEED),
         told_by_neighbours(scene, scene.of_split(split)),
     )
 
@@ -81,8 +88,8 @@ def load_metrics() -> None:
 def look(trainer: FieldTrainer, unseen: Unseen) -> Look:
     """How the field does on photos that it has never seen, exposed as their neighbours let expect."""
     as_expected = trainer.effects.of_held_out(unseen.neighbours)
-    psnr = measure(trainer.model, unseen.probe, as_expected).psnr
-    rows = zip(*pictures(trainer.model, unseen.patches, as_expected), unseen.patches.used, strict=True)
+    psnr = evaluate(trainer.model, unseen.probe, as_expected).psnr
+    rows = zip(*render_patches(trainer.model, unseen.patches, as_expected), unseen.patches.used, strict=True)
     known = [value for row in rows if (value := ssim(*(part.cpu() for part in row))) is not None]
     return Look(psnr, sum(known) / len(known) if known else None)
 

@@ -12,9 +12,9 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
+from nerf.training.evaluation_pixels import evaluate, sample_evaluation_pixels
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.validation_probe import make_probe, measure
 from nerf.training.vanilla_trainer import VanillaTrainer
 from stages import train
 from stages.contract import StageError, StageResult
@@ -48,7 +48,7 @@ NAMED = ("training diverged", "the field does not learn")
 @pytest.fixture(autouse=True)
 def short_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop, "WARM_UP_STEPS", WARM_UP)
-    monkeypatch.setattr("stages.train.training.write_parts", lambda *_: [])
+    monkeypatch.setattr("stages.train.training.write_profile", lambda *_: [])
     monkeypatch.setattr("stages.train.validation_images.PROBE_RAYS", 256)
     monkeypatch.setattr(
         "nerf.fields.occupancy_grid.UPDATE_INTERVAL", 32
@@ -70,8 +70,8 @@ def trained(kind: str, inputs: dict[str, Path], folder: Path, progress: Any, **s
 def seen(folder: Path, inputs: dict[str, Path], progress: Any) -> tuple[float, float]:
     """PSNR of the field in ``folder`` on training photos, and that of a flat colour."""
     dataset = training_dataset(inputs["ingest"], read_scene(inputs["normalise"]), "train", 1.0, progress)
-    probe = make_probe(dataset, 512, torch.ones(3), 0)
-    return measure(load_field(folder)[0], probe).psnr, probe.mean_colour_psnr
+    probe = sample_evaluation_pixels(dataset, 512, torch.ones(3), 0)
+    return evaluate(load_field(folder)[0], probe).psnr, probe.mean_colour_psnr
 
 
 @pytest.mark.parametrize("steps", [WARM_UP - 20, WARM_UP + 20])
@@ -133,7 +133,12 @@ def test_weights_that_the_last_update_broke_are_never_kept(
 
 
 # Of the dataset: near and far, the cameras' places, their rotations; and how ray directions change from pixel to pixel.
-ROWS = {"near": ("geometry", 12), "far": ("geometry", 13), "centres": ("geometry", 9), "rotations": ("geometry", 4)}
+ROWS = {
+    "near": ("view_geometry", 12),
+    "far": ("view_geometry", 13),
+    "centres": ("view_geometry", 9),
+    "rotations": ("view_geometry", 4),
+}
 ROWS["ray_directions"] = ("patches", 1)
 
 
@@ -225,7 +230,7 @@ def test_no_number_is_a_symptom(inputs: dict[str, Path], progress: Any) -> None:
     """Comparisons with NaN are false: neither empty nor worse than a flat colour would be said of it."""
     dataset = training_dataset(inputs["ingest"], read_scene(inputs["normalise"]), "train", 1.0, progress)
     trainer = train_loop_trainer(inputs, dataset)
-    probe = make_probe(dataset, 64, torch.ones(3), 0)
+    probe = sample_evaluation_pixels(dataset, 64, torch.ones(3), 0)
     trainer.model.colour_out[:] = float("nan")
     assert symptom_of(trainer, probe) == "its model.colour_out is not finite"
     trainer.model.colour_out[:] = 3e38

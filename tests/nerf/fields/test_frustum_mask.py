@@ -63,7 +63,7 @@ def middles(cells: int) -> torch.Tensor:
 def projected(views: RayDataset, points: torch.Tensor, near: float, half: float) -> torch.Tensor:
     """How many photos have the points in their picture, between ``near`` and far."""
     photos = torch.zeros(len(points), dtype=torch.int32)
-    for geometry in views.geometry.T:
+    for geometry in views.view_geometry.T:
         local = (points - geometry[9:12]) @ geometry[:9].view(3, 3)
         inside = (local[:, :2].abs() <= half * (1 - 1 / SIZE) * local[:, 2:]).all(-1) & (local[:, 2] > 0)
         distance = local.norm(dim=-1)

@@ -12,6 +12,7 @@ from nerf.fields.background import background_colour
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.rays import Rays
 from nerf.kernels import torch as reference
+from nerf.training.evaluation_pixels import evaluate, sample_evaluation_pixels
 from nerf.training.hash_grid_trainer import (
     HashGridBatch,
     HashGridTrainer,
@@ -21,7 +22,6 @@ from nerf.training.hash_grid_trainer import (
 )
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from nerf.training.trainer import FieldTrainer, NonFinite
-from nerf.training.validation_probe import make_probe, measure
 
 FIELD = HashGridSettings(
     num_levels=2, log2_hashmap_size=10, base_res=4, max_res=16, diagonal_steps=32, occupancy_resolution=16
@@ -60,11 +60,11 @@ def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
 
 def test_it_trains_behind_the_common_interface() -> None:
     run: FieldTrainer = trainer()
-    probe = make_probe(small_dataset(), 288, torch.ones(3), seed=5)
-    before = measure(run.model, probe).psnr
+    probe = sample_evaluation_pixels(small_dataset(), 288, torch.ones(3), seed=5)
+    before = evaluate(run.model, probe).psnr
     for step in range(80):
         run.step(step, step / 80, 1.0)
-    after = measure(run.model, probe).psnr
+    after = evaluate(run.model, probe).psnr
     assert before < probe.mean_colour_psnr < probe.mean_colour_psnr + 5 < after < 60
 
 
@@ -248,7 +248,7 @@ def unequal_dataset() -> RayDataset:
     half = len(dataset.pixels) // 2
     colour = dataset.pixels[:half, :3].where(dataset.pixels[:half, 3:] > 0, 0)
     darker = (255 * expose(colour / 255, torch.full((3,), -math.log(2)))).round().byte()
-    geometry = dataset.geometry[:, :1].repeat(1, 2)
+    geometry = dataset.view_geometry[:, :1].repeat(1, 2)
     return dataset._replace(pixels=torch.cat([colour, darker]), geometry=geometry)
 
 
@@ -393,7 +393,7 @@ def test_points_beyond_the_box_of_a_bounded_scene_are_no_guide() -> None:
     dataset = small_dataset().with_sparse_depths(torch.tensor([78, 78]), torch.tensor([3.0, 4.5]))
     outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1)
     for field, distances in {FIELD: [3.0], outdoors: [3.0, 4.5]}.items():
-        kept = HashGridTrainer(HashGridField(field, 0, reference), dataset, TRAINER).dataset.distance
+        kept = HashGridTrainer(HashGridField(field, 0, reference), dataset, TRAINER).dataset.sparse_depths
         assert kept is not None and kept.tolist() == distances
 
 

@@ -25,12 +25,12 @@ def part_without_effects(run: HashGridTrainer, step: int, progress: float, rays:
     batch = run._batch(step, progress, chunk, rays)
     done = run.model.forward(batch.rays, batch.jitter, batch.thinning_offset, batch.background)
     error = done.rendering.colour - batch.target
-    robust, pull = huber_loss(error)
+    huber, half_gradient = huber_loss(error)
     none = torch.zeros(rays)
-    grad = Rendering(pull * (2 / (3 * rays)), none, none)
+    grad = Rendering(half_gradient * (2 / (3 * rays)), none, none)
     gradients = run.model.backward(done, grad, torch.zeros_like(done.weights))
     norm = torch.nn.utils.get_total_norm([*gradients.weights, gradients.features])
-    losses = robust.sum() / (3 * rays), error.square().sum() / (3 * rays)
+    losses = huber.sum() / (3 * rays), error.square().sum() / (3 * rays)
     learnt = gradients.weights, gradients.features, done.points, dict[str, Tensor](), dict[str, Tensor]()
     return _MicroBatch(batch, *losses, *learnt, norm, done.optical_thickness, done.density_evaluations)
 
@@ -63,7 +63,7 @@ def test_steps_draw_every_pixel_once_before_any_again(monkeypatch: pytest.Monkey
         small_dataset(16).with_sparse_depths(torch.tensor([136, 392]), torch.tensor([3.0, 2.5])),
         list[Tensor](),
     )
-    assert dataset.known is not None and dataset.unmasked_count == 512
+    assert dataset.sparse_pixels is not None and dataset.unmasked_count == 512
     monkeypatch.setattr(RayDataset, "nth", lambda _, numbers: drawn.append(numbers) or numbers)
     settings = replace(TRAINER, micro_batches=3, depth_weight=0.1)
     run, rays = HashGridTrainer(HashGridField(FIELD, 0, reference), dataset, settings), set[int]()

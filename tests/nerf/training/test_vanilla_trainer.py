@@ -10,9 +10,9 @@ from nerf.effects.exposure import ExposureModel
 from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
+from nerf.training.evaluation_pixels import evaluate, sample_evaluation_pixels
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from nerf.training.trainer import NonFinite, composite_over
-from nerf.training.validation_probe import make_probe, measure
 from nerf.training.vanilla_trainer import VanillaTrainer, VanillaTrainerSettings
 from tests.nerf.training.test_hash_grid_trainer import copied, same
 
@@ -76,11 +76,11 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 def test_training_beats_a_flat_colour() -> None:
     dataset = small_dataset()
     run = trainer(dataset=dataset)
-    probe = make_probe(dataset, 288, torch.ones(3), seed=5)
-    assert measure(run.model, probe).psnr < probe.mean_colour_psnr + 2
+    probe = sample_evaluation_pixels(dataset, 288, torch.ones(3), seed=5)
+    assert evaluate(run.model, probe).psnr < probe.mean_colour_psnr + 2
     for step in range(150):
         run.step(step, step / 150)
-    assert probe.mean_colour_psnr + 3 < measure(run.model, probe).psnr < 60
+    assert probe.mean_colour_psnr + 3 < evaluate(run.model, probe).psnr < 60
 
 
 def test_the_loss_is_the_sum_of_both_renderings_mean_squared_errors() -> None:

@@ -14,7 +14,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 
 from nerf.geometry.scene import Camera, Scene, Similarity, View
-from nerf.training.learning_curve import Gain
+from nerf.training.learning_curve import PredictedGain
 from stages.report import plots
 from stages.report.plots import ORDER_COLOURS, _outline, camera_svgs, curve_svg
 from stages.train.curve import coming_doubling
@@ -94,7 +94,7 @@ def test_neighbouring_times_do_not_run_into_each_other():
 def test_the_prediction_lies_inside_the_plot(monkeypatch: pytest.MonkeyPatch):
     tops: list[float] = []
     monkeypatch.setattr(plots, "svg_element", lambda figure: str(tops.append(figure.axes[0].get_ylim()[1])))
-    curve, coming = _curve(), Gain(8.0, 0.5)
+    curve, coming = _curve(), PredictedGain(8.0, 0.5)
     curve_svg(curve, {"nearest photo": 14.2}, coming)
     assert curve[-1]["heldout_psnr"] + 8.5 <= tops[0] < 40
 

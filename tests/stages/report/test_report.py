@@ -14,7 +14,7 @@ from stages.io.files import read_json, write_json
 from stages.report import page
 from stages.tradeoff.pareto_front import recommend, table
 from tests.refusals import refused
-from tests.stages.report.report_workspace import LINES, PARTS, make_workspace, written
+from tests.stages.report.report_workspace import LINES, SPANS, make_workspace, written
 from tests.stages.tradeoff.test_pareto_front import point
 
 
@@ -63,7 +63,7 @@ def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path
         "stage_seconds": {"ingest": 2.5, "sfm": 58.2, "normalise": 2.5, "train": 181.7}
         | {"evaluate": 2.5, "render": 60.1, "mesh": 2.5},
         "expected_seconds": {},
-        "training_parts": PARTS,
+        "training_profile": SPANS,
         "psnr": 21.5,
         "ssim": 0.62,
         "psnr_mean_image": 12.9,
@@ -330,7 +330,7 @@ def test_training_shows_where_its_time_went(inputs: dict[str, Path], tmp_path: P
 def test_a_training_without_timed_steps_is_no_fault(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     (inputs["train"] / "profile.json").unlink()
     html, summary = written(inputs, tmp_path / "out", progress)
-    assert "Where training spent its time" not in html and summary["training_parts"] is None
+    assert "Where training spent its time" not in html and summary["training_profile"] is None
 
 
 def test_a_field_of_no_use_is_named(inputs: dict[str, Path], tmp_path: Path, progress: Any):

@@ -11,8 +11,8 @@ from torch import Tensor
 from nerf.effects import NO_EFFECTS
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
+from nerf.training.evaluation_pixels import EvaluationPatches, EvaluationPixels
 from nerf.training.trainer import StepResult
-from nerf.training.validation_probe import Patches, Probe
 from stages.train.loop import TrainingRun
 from stages.train.state import Probes, TrainingBudget, TrainingLog
 from stages.train.validation_images import Target, Unseen
@@ -69,15 +69,15 @@ def slow(step: int, lr_scale: float) -> None:
     time.sleep(0.003)
 
 
-def probe() -> Probe:
+def probe() -> EvaluationPixels:
     """Two rays, one to see black and one grey: a flat colour leaves a mean error of 1/16."""
     rays = Rays(torch.zeros(2, 3), torch.ones(2, 3), torch.ones(2), torch.ones(2))
-    return Probe(rays, torch.tensor([[0.0] * 3, [0.5] * 3]), torch.zeros(3), torch.tensor([0, 1]))
+    return EvaluationPixels(rays, torch.tensor([[0.0] * 3, [0.5] * 3]), torch.zeros(3), torch.tensor([0, 1]))
 
 
 def unseen() -> Unseen:
     """The same rays; their patches are too small for SSIM."""
-    return Unseen(probe(), Patches(probe(), torch.ones(2, 1, 1, dtype=torch.bool)), torch.eye(2))
+    return Unseen(probe(), EvaluationPatches(probe(), torch.ones(2, 1, 1, dtype=torch.bool)), torch.eye(2))
 
 
 def run_in(

@@ -2,7 +2,7 @@
 
 import pytest
 
-from nerf.training.learning_curve import Gain
+from nerf.training.learning_curve import PredictedGain
 from stages.train.curve import doubling_words, next_words, ssim_words
 
 POINTS = [{"seconds": 10.0 * 2**k, "heldout_psnr": 20.0 + k} for k in range(5)]
@@ -13,13 +13,13 @@ def test_the_last_doubling_and_the_next_are_those_of_training_time() -> None:
     assert doubling_words(POINTS, None) == last
     less = "(less over a run of half the time, which would have ended above this curve)"
     again = "as long again at these sizes (--more 160s) is predicted to buy +0.7 dB (± 0.4)"
-    assert doubling_words(POINTS, Gain(0.71, 0.37)) == f"{last} {less}; {again}"
+    assert doubling_words(POINTS, PredictedGain(0.71, 0.37)) == f"{last} {less}; {again}"
     assert doubling_words(POINTS[-1:], None) is None
 
 
 def test_in_a_line_it_is_said_of_what() -> None:
     said = "as long again (--more 160s) is predicted to buy +0.7 ± 0.4 dB"
-    assert next_words(POINTS, Gain(0.71, 0.37)) == said
+    assert next_words(POINTS, PredictedGain(0.71, 0.37)) == said
     assert next_words(POINTS, None) is None
 
 

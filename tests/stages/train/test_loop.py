@@ -237,7 +237,7 @@ def towards(folder: Path, progress, target: float, make=Rising, steps: int = 100
 
 
 def reasons(run: TrainingRun) -> list[str]:
-    return [decision.reason for decision in run.plan.decisions]
+    return [decision.reason for decision in run.plan.revisions]
 
 
 def test_a_target_ends_the_run_once_it_is_reached(tmp_path: Path, progress) -> None:
@@ -258,7 +258,7 @@ def test_annealing_that_does_not_suffice_is_undone(tmp_path: Path, progress) -> 
     run = towards(tmp_path, progress, 20.0, RisingLess)
     assert reasons(run)[:3] == ["begin", "target", "more"]
     assert run.state.validation_psnr is not None and 20.0 <= run.state.validation_psnr < 20.3
-    back = run.plan.decisions[2]
+    back = run.plan.revisions[2]
     assert (back.total_steps, back.progress) == (1000, back.from_step / 1000)
 
 
@@ -289,7 +289,7 @@ def test_more_steps_towards_a_higher_target_anneal_as_if_none_had_been(tmp_path:
     first = towards(tmp_path / "first", progress, 20.0)
     more = more_towards(tmp_path / "more", progress, 20.8, tmp_path / "first")
     assert more.state.validation_psnr is not None and 20.8 <= more.state.validation_psnr < 21.1
-    closing = more.plan.decisions[len(first.plan.decisions) + 1]
+    closing = more.plan.revisions[len(first.plan.revisions) + 1]
     seen = {e["step"]: e["psnr"] for e in events(tmp_path / "more") if e["event"] == "validated"}
     assert closing.reason == "target" and 19.8 <= seen[closing.from_step] < 20.3, "within 1 dB, not a part of that"
 

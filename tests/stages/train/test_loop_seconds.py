@@ -20,7 +20,7 @@ def test_a_run_in_seconds_takes_about_that_long_and_its_share_ends_at_1(tmp_path
     run.train()
     assert 0.2 < run.state.seconds < 0.5
     assert run.plan.progress(run.state.step) == pytest.approx(1)
-    assert len(run.plan.decisions) >= 2
+    assert len(run.plan.revisions) >= 2
     shares = [share for _, share, _ in number_of(run).history]
     assert 0.8 < shares[-1] < 1
 
@@ -31,7 +31,7 @@ def test_a_resumed_run_in_seconds_keeps_its_plan_and_its_clock(tmp_path: Path, p
     journal = json.loads((tmp_path / "plan.json").read_text())
     resumed = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
     resumed.train()
-    assert [list(decision) for decision in resumed.plan.decisions][: len(journal)] == journal
+    assert [list(decision) for decision in resumed.plan.revisions][: len(journal)] == journal
     assert number_of(resumed).history[0][:2] == (30, resumed.plan.progress(30))
     assert 0.2 < resumed.state.seconds < 0.5
     assert any(note.startswith("going on from step 30, with 0 s of training left") for note in progress.notes)

@@ -307,7 +307,7 @@ def test_every_seed_is_measured_on_the_same_pixels(tmp_path: Path, progress) -> 
         probes = prepare(config, scene, inputs, folder, progress).probes
         assert probes.heldout and probes.target
         unseen = (probes.heldout, probes.target.photos)
-        others = (probe for each in unseen for probe in (each.probe, each.patches.probe))
+        others = (probe for each in unseen for probe in (each.probe, each.patches.pixels))
         found.append([probe.colours for probe in (probes.train, *others)])
     assert len(found[0]) == 5 and all(torch.equal(*pair) for pair in zip(*found, strict=True))
 
