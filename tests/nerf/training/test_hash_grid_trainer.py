@@ -249,7 +249,7 @@ def unequal_dataset() -> RayDataset:
     colour = dataset.pixels[:half, :3].where(dataset.pixels[:half, 3:] > 0, 0)
     darker = (255 * expose(colour / 255, torch.full((3,), -math.log(2)))).round().byte()
     geometry = dataset.view_geometry[:, :1].repeat(1, 2)
-    return dataset._replace(pixels=torch.cat([colour, darker]), geometry=geometry)
+    return dataset._replace(pixels=torch.cat([colour, darker]), view_geometry=geometry)
 
 
 def test_exposures_are_learnt_where_they_are_modelled() -> None:
