@@ -25,7 +25,7 @@ from nerf.training import hash_grid_trainer
 from nerf.training.evaluation_pixels import EvaluationPixels, evaluate, sample_evaluation_pixels
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.schedule import schedule_of
+from nerf.training.schedule import new_schedule
 from nerf.training.trainer import FieldTrainer
 from stages.effects.decisions import Decisions, image_effects, read_decisions, told_by_neighbours
 from stages.hardware.backend import chosen_backend, load_backend
@@ -118,7 +118,7 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
     assert isinstance(trainer, HashGridTrainer)
     means = {name: RunningMean(trainer, exponent) for name, exponent in MEANS.items()}
     due = {round(steps / 2 ** (k / PER_DOUBLING)) for k in range(PER_DOUBLING * int(math.log2(steps / FIRST)) + 1)}
-    plan = schedule_of(steps) if schedule == "whole" else schedule_of(steps // 2).extended(steps)
+    plan = new_schedule(steps) if schedule == "whole" else new_schedule(steps // 2).extended_to(steps)
     points, pace, rays = [], 0.0, 0
     for step in range(steps):
         result = trainer.step(step, plan.progress(step))

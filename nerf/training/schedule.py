@@ -57,7 +57,7 @@ class StepSchedule(NamedTuple):
         Raises ValueError where that would leave no step to take, or rewrite a decision already made.
         """
         if not self.revisions[-1].from_step <= step < total_steps:
-            raise ValueError(f"at step {step} the plan {self.decisions} cannot become {total_steps} steps")
+            raise ValueError(f"at step {step} the plan {self.revisions} cannot become {total_steps} steps")
         return StepSchedule((*self.revisions, ScheduleRevision(step, total_steps, progress, "clock")))
 
     def until(self, step: int) -> "StepSchedule":
@@ -68,7 +68,7 @@ class StepSchedule(NamedTuple):
         """This plan with ``step`` as the first one of the last quarter of a run, or of what is left if that is less.
         Raises ValueError where that rewrites a decision or leaves no step."""
         if not self.revisions[-1].from_step <= step < self.total_steps:
-            raise ValueError(f"the plan {self.decisions} cannot close at step {step}")
+            raise ValueError(f"the plan {self.revisions} cannot close at step {step}")
         total = min(self.total_steps, max(step + 1, round(step / DECAY_START_PROGRESS)))
         progress = max(DECAY_START_PROGRESS, self.progress(step))
         return StepSchedule((*self.revisions, ScheduleRevision(step, total, progress, "target")))
@@ -76,7 +76,7 @@ class StepSchedule(NamedTuple):
     def ended_at(self, step: int) -> "StepSchedule":
         """This plan without the steps from ``step`` on. Raises ValueError where that rewrites a decision."""
         if not self.revisions[-1].from_step < step <= self.total_steps:
-            raise ValueError(f"the plan {self.decisions} cannot end at step {step}")
+            raise ValueError(f"the plan {self.revisions} cannot end at step {step}")
         return StepSchedule((*self.revisions, ScheduleRevision(step, step, self.progress(step), "target")))
 
     def extended_to(self, total_steps: int) -> "StepSchedule":

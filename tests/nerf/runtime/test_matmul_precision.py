@@ -29,7 +29,7 @@ def rounded(values: torch.Tensor, bits: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    "speedup, error, pays", [(1.3, 1e-4, True), (1.29, 0.0, False), (5.0, 1.1e-4, False), (5.0, math.nan, False)]
+    "speedup, error, is_worthwhile", [(1.3, 1e-4, True), (1.29, 0.0, False), (5.0, 1.1e-4, False), (5.0, math.nan, False)]
 )
 def test_it_pays_where_it_is_faster_and_about_as_exact(speedup: float, error: float, is_worthwhile: bool) -> None:
     assert MediumPrecision(speedup, error).is_worthwhile is is_worthwhile
@@ -54,8 +54,8 @@ def test_the_fastest_of_several_counts(seconds: dict[str, float], speedup: float
         asked.append((torch.get_float32_matmul_precision(), *a.shape, *b.shape))
         return seconds.get(asked[-1][0], 1.0) * (3.0 if len(asked) < 5 else 1.0)
 
-    monkeypatch.setattr(matmul_precision, "TRIED_SECONDS", 0.0)
-    monkeypatch.setattr(matmul_precision, "seconds_of_product", made_up)
+    monkeypatch.setattr(matmul_precision, "TRIAL_SECONDS", 0.0)
+    monkeypatch.setattr(matmul_precision, "matmul_seconds", made_up)
     found = measure_medium_matmul(CPU, 64)
     assert found.speedup == speedup and 0 <= found.error < 0.1
     assert asked == [("highest", 8192, 64, 64, 64), ("medium", 8192, 64, 64, 64)] * 3
