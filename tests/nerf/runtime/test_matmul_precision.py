@@ -29,7 +29,8 @@ def rounded(values: torch.Tensor, bits: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    "speedup, error, is_worthwhile", [(1.3, 1e-4, True), (1.29, 0.0, False), (5.0, 1.1e-4, False), (5.0, math.nan, False)]
+    "speedup, error, is_worthwhile",
+    [(1.3, 1e-4, True), (1.29, 0.0, False), (5.0, 1.1e-4, False), (5.0, math.nan, False)],
 )
 def test_it_pays_where_it_is_faster_and_about_as_exact(speedup: float, error: float, is_worthwhile: bool) -> None:
     assert MediumPrecision(speedup, error).is_worthwhile is is_worthwhile

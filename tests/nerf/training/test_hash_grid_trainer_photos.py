@@ -64,7 +64,7 @@ def test_steps_draw_every_pixel_once_before_any_again(monkeypatch: pytest.Monkey
         list[Tensor](),
     )
     assert dataset.sparse_pixels is not None and dataset.unmasked_count == 512
-    monkeypatch.setattr(RayDataset, "nth", lambda _, numbers: drawn.append(numbers) or numbers)
+    monkeypatch.setattr(RayDataset, "unmasked_pixels", lambda _, numbers: drawn.append(numbers) or numbers)
     settings = replace(TRAINER, micro_batches=3, depth_weight=0.1)
     run, rays = HashGridTrainer(HashGridField(FIELD, 0, reference), dataset, settings), set[int]()
     for step in range(40):

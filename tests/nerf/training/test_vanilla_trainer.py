@@ -141,7 +141,7 @@ def test_a_random_background_is_new_in_every_step_and_shines_through_alpha() -> 
 
 def test_steps_draw_every_pixel_once_before_any_again(monkeypatch: pytest.MonkeyPatch) -> None:
     run, drawn = trainer(dataset=small_dataset(size=16)), list[Tensor]()
-    monkeypatch.setattr(RayDataset, "nth", lambda _, numbers: drawn.append(numbers) or numbers)
+    monkeypatch.setattr(RayDataset, "unmasked_pixels", lambda _, numbers: drawn.append(numbers) or numbers)
     for step in range(12):
         run.step(step, 0.0)
     often = torch.cat(drawn).bincount(minlength=512)
