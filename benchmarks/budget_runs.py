@@ -39,7 +39,7 @@ from stages.train.planning import chosen_downscale
 BUDGETS = (125, 250, 500, 1000, 2000)
 ONCE = 1000  # steps that draw every pixel of the training photos once: it is their number that gives the photos' size
 CHUNKS = 2
-PROBE_RAYS = 2048
+EVALUATION_PIXELS = 2048
 PER_DOUBLING = 2  # measurements
 FIRST = 32  # steps
 MEAN_EVERY = 8  # steps
@@ -89,7 +89,7 @@ def bench_of(workspace: Path) -> Bench:
     train = guided_dataset(inputs, scene, downscale, Quiet())
     test = training_dataset(inputs["ingest"], scene, "test", downscale, Quiet())
     shown_over = torch.tensor(field_background(config, scene))
-    probe = sample_evaluation_pixels(test, PROBE_RAYS, shown_over, seed=0)
+    probe = sample_evaluation_pixels(test, EVALUATION_PIXELS, shown_over, seed=0)
     return Bench(config, scene, decisions, train, probe, told_by_neighbours(scene, scene.of_split("test")))
 
 
@@ -119,10 +119,10 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
     means = {name: RunningMean(trainer, exponent) for name, exponent in MEANS.items()}
     due = {round(steps / 2 ** (k / PER_DOUBLING)) for k in range(PER_DOUBLING * int(math.log2(steps / FIRST)) + 1)}
     plan = new_schedule(steps) if schedule == "whole" else new_schedule(steps // 2).extended_to(steps)
-    points, pace, rays = [], 0.0, 0
+    points, speed, rays = [], 0.0, 0
     for step in range(steps):
         result = trainer.step(step, plan.progress(step))
-        pace += (result.psnr - pace) * max(1 / (step + 1), 0.02)
+        speed += (result.psnr - speed) * max(1 / (step + 1), 0.02)
         rays += result.rays
         if (step + 1) % MEAN_EVERY == 0:
             for mean in means.values():
@@ -131,7 +131,7 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
             as_expected = trainer.effects.of_held_out(bench.neighbours)
             models = {"heldout_psnr": trainer.model} | {name: mean.model for name, mean in means.items()}
             psnr = {name: evaluate(model, bench.probe, as_expected).psnr for name, model in models.items()}
-            points.append({"step": step + 1, "train_psnr": pace, **psnr})
+            points.append({"step": step + 1, "train_psnr": speed, **psnr})
     return {"rays": rays, "pixels": bench.dataset.unmasked_count, "points": points}
 
 

@@ -93,7 +93,7 @@ def figures(workspace: Path, case: Case, memory_gb: float) -> dict[str, Any]:
         "downscale": case.downscale,
         "seconds": case.seconds,
         "grids": f"{field['levels']} × 2^{field['log2_rows']} to {field['finest']}",
-        **{name: facts[name] for name in ("steps", "rays_per_second", "samples_per_second")},
+        **{name: facts[name] for name in ("steps", "rays_per_second", "colours_per_second")},
         "psnr": metrics["psnr"],
         "ssim": metrics["ssim"],
         "frame_seconds": frame,

@@ -76,9 +76,9 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     from stages.evaluate.half_images import enough
     from stages.hardware.device import compute_device
     from stages.train.data import ALL_MASKED, PhotoReader, guided_dataset, view_mask, view_rays
-    from stages.train.validation_images import set_aside
+    from stages.train.validation_images import split_off_validation
 
-    split = set_aside(scene, MAX_KEPT, MIN_FOR_INTERVAL)
+    split = split_off_validation(scene, MAX_KEPT, MIN_FOR_INTERVAL)
     if split is None:
         return "too few training photos"
     cameras = [scene.cameras[view.camera] for view in scene.views]

@@ -34,7 +34,7 @@ from stages.report.effects import effects_table
 from stages.report.plots import ORDER_COLOURS, camera_svgs, curve_svg
 from stages.report.profile import profile_bar
 from stages.tradeoff.plots import COLUMNS, plot_svg, rendering_sentence, table_cells
-from stages.train.curve import coming_doubling, doubling_words, knee_words, more_option, ssim_words
+from stages.train.curve import diminishing_returns_message, doubling_message, more_option, predicted_gain, ssim_message
 
 if TYPE_CHECKING:
     from stages.report import Config
@@ -264,11 +264,11 @@ def _curve(results: Results) -> dict[str, Any] | None:
         return None
     points, metrics = results.curve["points"], results.metrics or {}
     baselines = {"nearest training view": "psnr_nearest_view", "mean image": "psnr_mean_image"}
-    coming = coming_doubling(results.curve["field"], results.curve["whole"], points)
+    coming = predicted_gain(results.curve["field"], results.curve["single_cycle"], points)
     svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming)
     if svg is None:
         return None
-    words = [doubling_words(points, coming), knee_words(points), ssim_words(points)]
+    words = [doubling_message(points, coming), diminishing_returns_message(points), ssim_message(points)]
     threads = results.curve["threads"]
     where = "a GPU" if results.curve["device"] == "cuda" else f"{threads} processor core{'' if threads == 1 else 's'}"
     sentences = [f"{word[0].upper()}{word[1:]}." for word in words if word]

@@ -30,9 +30,9 @@ ROOM_BELOW = 0.08  # of the curve's height, so that the name of the lowest line 
 def curve_svg(
     points: Sequence[dict[str, Any]], baselines: dict[str, float | None], coming: PredictedGain | None = None
 ) -> str | None:
-    """PSNR against training seconds, one grid line per doubling of the time, with the knee and what is ``coming``, what
-    the next doubling is predicted to buy; None for fewer than two points. ``baselines`` are drawn as horizontal lines
-    under their names.
+    """PSNR against training seconds, one grid line per doubling of the time, with the start of diminishing returns and
+    the ``coming`` gain the next doubling is predicted to buy; None for fewer than two points. ``baselines`` are drawn
+    as horizontal lines under their names.
     """
     rows = [row for row in points if row["seconds"] > 0]
     if len(rows) < 2:
@@ -46,7 +46,7 @@ def curve_svg(
         if coming is not None:
             _draw_prediction(axes, rows, coming)
         last = rows[-1]["seconds"] * (1 if coming is None else 2)
-        _draw_knee(axes, heldout_curve(rows))
+        _draw_diminishing_returns(axes, heldout_curve(rows))
         # Last, for they fix the limits, beyond which nothing is seen.
         _draw_baselines(axes, {name: psnr for name, psnr in baselines.items() if psnr is not None})
         _doubling_axis(axes, rows[0]["seconds"], rows[-1]["seconds"], last)
@@ -62,10 +62,10 @@ def _draw_prediction(axes: Axes, rows: Sequence[dict[str, Any]], coming: Predict
     axes.errorbar(2 * seconds, psnr + coming.db, coming.half_width, color=BLUE, capsize=4, lw=1.5)
 
 
-def _draw_knee(axes: Axes, curve: Sequence[tuple[float, float]]) -> None:
+def _draw_diminishing_returns(axes: Axes, curve: Sequence[tuple[float, float]]) -> None:
     if (seconds := diminishing_returns_seconds(curve)) is not None:
         ring = {"color": "none", "mec": ORANGE, "ms": 11, "mew": 2}
-        axes.plot(seconds, quality_at(curve, seconds), "o", label=f"knee, {duration(seconds)}", **ring)
+        axes.plot(seconds, quality_at(curve, seconds), "o", label=f"diminishing returns, {duration(seconds)}", **ring)
 
 
 def _draw_baselines(axes: Axes, baselines: dict[str, float]) -> None:

@@ -54,21 +54,21 @@ def test_a_short_curve_tells_nothing(curve: list[tuple[float, float]]):
     )
 
 
-def test_the_knee_is_where_doublings_begin_to_buy_little():
+def test_returns_diminish_where_doublings_begin_to_gain_little():
     # 4, 2, 1, 0.5, 0.25 …: from 16 on less than half a decibel, at 8 just that much.
     assert diminishing_returns_seconds(saturating(4.0)) == 16.0
 
 
 @given(st.floats(MIN_DOUBLING_GAIN_DB, 3))
-def test_no_knee_while_doublings_buy_much(per_doubling: float):
+def test_returns_do_not_diminish_while_doublings_gain_much(per_doubling: float):
     assert diminishing_returns_seconds(straight(per_doubling * (1 + 1e-9))) is None
 
 
-def test_a_flat_curve_is_all_knee():
+def test_returns_of_a_flat_curve_always_diminish():
     assert diminishing_returns_seconds(straight(0.1)) == 1.0
 
 
-def test_a_late_rise_undoes_a_knee():
+def test_a_late_rise_undoes_diminishing_returns():
     flat_then_steep = [(1.0, 20.0), (2.0, 20.1), (4.0, 20.2), (8.0, 22.0)]
     assert diminishing_returns_seconds(flat_then_steep) is None
 

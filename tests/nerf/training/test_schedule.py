@@ -91,7 +91,7 @@ def test_a_run_may_end_at_any_step_it_has_come_to() -> None:
 
 @pytest.mark.parametrize("total", [4, 3])
 def test_more_steps_are_more_than_there_were(total: int) -> None:
-    with pytest.raises(ValueError, match="cannot go on"):
+    with pytest.raises(ValueError, match="cannot be extended"):
         new_schedule(4).extended_to(total)
 
 

@@ -17,7 +17,7 @@ from nerf.geometry.scene import Camera, Scene, Similarity, View
 from nerf.training.learning_curve import PredictedGain
 from stages.report import plots
 from stages.report.plots import ORDER_COLOURS, _outline, camera_svgs, curve_svg
-from stages.train.curve import coming_doubling
+from stages.train.curve import predicted_gain
 
 
 def _scene(count: int = 9) -> Scene:
@@ -67,14 +67,14 @@ def test_plots_of_one_page_share_no_identifier():
     assert len(together) == len(set(together))
 
 
-def test_the_curve_shows_what_comes_next_and_where_the_knee_is():
-    steep = curve_svg(_curve(), {}, coming_doubling("grid", True, _curve())) or ""
-    assert "predicted" in steep and "knee" not in steep
+def test_the_curve_shows_what_comes_next_and_when_returns_diminish():
+    steep = curve_svg(_curve(), {}, predicted_gain("grid", True, _curve())) or ""
+    assert "predicted" in steep and "diminishing returns" not in steep
     flat = [row | {"heldout_psnr": 20 - 8 / row["seconds"]} for row in _curve()]
-    assert "knee, 16 s" in (curve_svg(flat, {}) or "")
+    assert "diminishing returns, 16 s" in (curve_svg(flat, {}) or "")
     unknown = [row | {"heldout_psnr": None} for row in _curve()]
     for about in (("grid", True, unknown), ("paper", True, _curve()), ("grid", False, _curve())):
-        assert coming_doubling(*about) is None
+        assert predicted_gain(*about) is None
     assert "predicted" not in (curve_svg(unknown, {}) or "predicted")
 
 
@@ -86,7 +86,7 @@ def test_curve_names_its_lines_and_needs_two_points():
 
 
 def test_neighbouring_times_do_not_run_into_each_other():
-    svg = curve_svg(_curve(), {}, coming_doubling("grid", True, _curve())) or ""
+    svg = curve_svg(_curve(), {}, predicted_gain("grid", True, _curve())) or ""
     times = [text for text in re.findall(r"<text[^>]*>([^<]+)</text>", svg) if re.fullmatch(r"[\d.]+ (s|min)", text)]
     assert {"2 min", "8 s", "4 min", "16 s"} <= set(times) and "min 8" not in svg
 

@@ -142,7 +142,7 @@ def test_page_tells_what_a_person_wants_to_know_in_that_order(inputs: dict[str, 
         '<span class="tag">median</span> &lt;script&gt;alert(1)',
         '<span class="tag">worst</span> IMG_0000.jpg',
         "All 6 test photos",
-        "bought +0.5 dB on held-out photos",
+        "gained +0.5 dB on test photos",
         "diverged or met non-finite values 2 times.",
         "from above",
         "only 12 matches with any other photo",
@@ -336,7 +336,7 @@ def test_a_training_without_timed_steps_is_no_fault(inputs: dict[str, Path], tmp
 def test_a_field_of_no_use_is_named(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     path = inputs["train"] / "manifest.json"
     manifest = json.loads(path.read_text("utf-8"))
-    manifest["facts"]["symptom"] = "it is empty (mean opacity 0e+00)"
+    manifest["facts"]["failure_reason"] = "it is empty (mean opacity 0e+00)"
     write_json(path, manifest)
     html, _ = written(inputs, tmp_path / "out", progress)
     assert "<b>The field is undertrained:</b> it is empty (mean opacity 0e+00)." in html

@@ -14,8 +14,8 @@ from nerf.geometry.rays import Rays
 from nerf.training.evaluation_pixels import EvaluationPatches, EvaluationPixels
 from nerf.training.trainer import StepResult
 from stages.train.loop import TrainingRun
-from stages.train.state import Probes, TrainingBudget, TrainingLog
-from stages.train.validation_images import Target, Unseen
+from stages.train.state import EvaluationSets, TrainingBudget, TrainingLog
+from stages.train.validation_images import HeldOutImages, Target
 
 
 class Killed(BaseException):
@@ -32,7 +32,7 @@ class OneNumber:
         self.seed, self.trouble = seed, trouble
         self.value = torch.tensor(float(seed))
         self.history: list[tuple[int, float, float]] = []
-        self.opacity, self.shown = 1.0, probe().colours + 0.1
+        self.opacity, self.shown = 1.0, pixels().colours + 0.1
 
     @property
     def model(self) -> "OneNumber":
@@ -69,15 +69,15 @@ def slow(step: int, lr_scale: float) -> None:
     time.sleep(0.003)
 
 
-def probe() -> EvaluationPixels:
+def pixels() -> EvaluationPixels:
     """Two rays, one to see black and one grey: a flat colour leaves a mean error of 1/16."""
     rays = Rays(torch.zeros(2, 3), torch.ones(2, 3), torch.ones(2), torch.ones(2))
     return EvaluationPixels(rays, torch.tensor([[0.0] * 3, [0.5] * 3]), torch.zeros(3), torch.tensor([0, 1]))
 
 
-def unseen() -> Unseen:
+def held_out() -> HeldOutImages:
     """The same rays; their patches are too small for SSIM."""
-    return Unseen(probe(), EvaluationPatches(probe(), torch.ones(2, 1, 1, dtype=torch.bool)), torch.eye(2))
+    return HeldOutImages(pixels(), EvaluationPatches(pixels(), torch.ones(2, 1, 1, dtype=torch.bool)), torch.eye(2))
 
 
 def run_in(
@@ -89,9 +89,12 @@ def run_in(
     checkpoint_seconds: float | None = 1e-9,
 ) -> TrainingRun:
     folder.mkdir(exist_ok=True)
-    maker, probes = make or (lambda attempt: OneNumber(attempt, quiet)), Probes(probe(), unseen(), target)
+    maker, evaluation_sets = (
+        make or (lambda attempt: OneNumber(attempt, quiet)),
+        EvaluationSets(pixels(), held_out(), target),
+    )
     budget, log = budget or TrainingBudget(40, None), TrainingLog(folder, False)
-    return TrainingRun(maker, probes, budget, folder, checkpoint_seconds, log, progress)
+    return TrainingRun(maker, evaluation_sets, budget, folder, checkpoint_seconds, log, progress)
 
 
 def number_of(run: TrainingRun) -> OneNumber:

@@ -123,12 +123,12 @@ def test_cameras_of_test_views_do_not_enter_the_training_dataset(tmp_path: Path,
 
 def test_evaluation_reads_the_pixels_that_training_stored(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path)
-    ingest, trained, unseen = inputs["ingest"], scene.of_split("train")[2], scene.of_split("test")[1]
+    ingest, trained, held_out = inputs["ingest"], scene.of_split("train")[2], scene.of_split("test")[1]
     reader = PhotoReader(ingest, scene, 2.0)
-    decoded = [reader.pixels(view, WHITE) for view in (trained, unseen)]
+    decoded = [reader.pixels(view, WHITE) for view in (trained, held_out)]
     for split in ("train", "test"):
         training_dataset(ingest, scene, split, 2.0, progress)
-    for view, pixels in zip((trained, unseen), decoded, strict=True):
+    for view, pixels in zip((trained, held_out), decoded, strict=True):
         (ingest / view.file).unlink()
         assert torch.equal(reader.pixels(view, WHITE), pixels)
 

@@ -21,7 +21,7 @@ def older_facts(folder: Path) -> None:
 
 
 def older_plan(folder: Path) -> None:
-    (folder / "plan.json").write_text(json.dumps([[0, 40, 0.0, "begin", "of another version"]]))
+    (folder / "schedule.json").write_text(json.dumps([[0, 40, 0.0, "begin", "of another version"]]))
 
 
 def damaged(folder: Path) -> None:
