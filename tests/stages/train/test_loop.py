@@ -38,7 +38,7 @@ def test_killed_and_resumed_is_the_same_as_uninterrupted(tmp_path: Path, progres
     resumed.train()
     assert number_of(resumed).history[0][0] == 20, "the resumed run does not start over"
     assert torch.equal(number_of(whole).value, number_of(resumed).value)
-    spent = [(run.state.step, run.state.rays, run.state.samples) for run in (whole, resumed)]
+    spent = [(run.state.step, run.state.rays, run.state.colour_evaluations) for run in (whole, resumed)]
     assert spent == 2 * [(40, 160, 480)]
     assert "resuming from step 20 of 40" in progress.notes
 
@@ -124,7 +124,7 @@ def test_a_field_that_stays_collapsed_fails_by_name(tmp_path: Path, progress, mo
 def test_the_curve_ends_with_the_run_and_is_on_record(
     tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(loop.FIRST_MEASUREMENT, "steps", 10.0)
+    monkeypatch.setitem(loop.FIRST_EVALUATION, "steps", 10.0)
     run = run_in(tmp_path, progress)
     run.train()
     assert run.state.curve[-1]["step"] == 40
@@ -138,7 +138,7 @@ def test_the_curve_ends_with_the_run_and_is_on_record(
 def test_what_was_measured_of_steps_taken_back_is_forgotten(
     tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(loop.FIRST_MEASUREMENT, "steps", 10.0)
+    monkeypatch.setitem(loop.FIRST_EVALUATION, "steps", 10.0)
 
     def trouble(step: int, lr_scale: float) -> None:
         if step == 22 and lr_scale == 1:
