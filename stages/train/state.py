@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from stages.contract import StageError
 
 if TYPE_CHECKING:
+    from nerf.training.evaluation_pixels import EvaluationPixels
     from stages.train.validation_images import HeldOutImages, Target
 
 SPEED_AVERAGING_SECONDS = 5.0  # of the speed and the batch PSNR that are shown
