@@ -27,7 +27,6 @@ from stages.train import trained_seconds
 
 if TYPE_CHECKING:
     import numpy as np
-    from torch import Tensor
 
     from nerf.fields.interface import Rendering
     from nerf.geometry.rays import Rays
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
     from stages.render.renderer import Allowance, Renderer
 
 INPUTS = ("normalise", "train")
-VERSION = 13
+VERSION = 14
 EXIT_CODE = 16
 RESUMES = False
 PUBLISHED = ("video.mp4", "depth.mp4", "path.json")
@@ -73,7 +72,7 @@ class Config(StageConfig):
     depth: bool = Field(default=True, description="write depth.mp4 too")
     match_exposure: str | None = Field(
         default=None,
-        description="name of a photo to render as it was exposed, where photos differ; none: neutral",
+        description="name of a photo to render as it was exposed, where photos differ; none: the reference exposure",
     )
     save_frames: bool = Field(default=False, description="keep every frame as PNG in frames/")
 
@@ -188,8 +187,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     assert config.width is not None and config.fps is not None
     scene = read_scene(inputs["normalise"])
     renderer = load_renderer(inputs["train"], progress=progress)
-    gain, exposure = _exposure(config.match_exposure, inputs["train"], scene, progress)
-    renderer = renderer if gain is None else renderer.at_gain(gain)
+    renderer, appearance = _as_asked(renderer, config.match_exposure, inputs["train"], scene, progress)
     path = _path(config, scene).resized(config.width)
     _check_memory(path)
     write_json(folder / "path.json", _path_json(path, scene, config.fps))
@@ -198,9 +196,9 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     outputs = ("path.json", *_write(renderings, path, config, folder))
     frames_per_second = len(path.cameras) / (time.perf_counter() - started)
     write_json(folder / "speed.json", {"frames_per_second": frames_per_second})
-    facts = _facts(config, path) | ({} if exposure is None else {"exposure": exposure})
+    facts = _facts(config, path) | ({} if appearance is None else {"appearance": appearance})
     line = f"{facts['path']}, {facts['frames']} frames {facts['width']}×{facts['height']}"
-    line += "" if exposure is None else f" · {exposure}"
+    line += "" if appearance is None else f" · {appearance}"
     return StageResult(outputs, f"{line} · drawn at {frames_per_second:.2g} frames/s", ("speed.json",), facts)
 
 
@@ -299,32 +297,33 @@ def _path_json(path: CameraPath, scene: "Scene", fps: int) -> dict[str, Any]:
     return (intrinsics(path.cameras[0]) if shared else {}) | {"fps": fps, "frames": frames}
 
 
-def _exposure(photo: str | None, train: Path, scene: "Scene", progress: Progress) -> "tuple[Tensor | None, str | None]":
-    """The log gain (3,) of the video, None as the field comes, and this in words, None where the field has only one.
+def _as_asked(
+    renderer: "Renderer", photo: str | None, train: Path, scene: "Scene", progress: Progress
+) -> "tuple[Renderer, str | None]":
+    """What renders the video, and what it shows of the photos' effects; None where there are none.
 
-    Training is over when this is found out: a photo of which no exposure is known is no error, but what is taken
-    instead is said.
+    Training is over when this is found out: a photo of which nothing is known is no error, but what is taken instead is
+    said.
     """
-    import torch
-
-    from stages.effects.decisions import expected_gains, neutral_in_words
+    from stages.effects.image_effects import new_view_like, new_view_words, photo_effects
 
     field = read_json(train / "field.json")
-    neutral = neutral_in_words(field)
-    if (known := field.get("exposure")) is None:
-        if photo is not None:
-            progress.note(f"exposure is not modelled: all photos count as exposed alike, and the video like {photo}")
-        return None, None
+    words = new_view_words(field)
     if photo is None:
-        return None, neutral
-    if photo in known["photos"]:
-        return torch.tensor(known["photos"][photo]), f"exposed like {photo}"
-    if unseen := [view for view in scene.views if view.name == photo]:
-        progress.note(f"{photo} was not trained on: its exposure is what the photos taken nearest by let expect")
-        return expected_gains(field, scene, unseen)[photo], f"exposed as expected of {photo}"
-    near = difflib.get_close_matches(photo, known["photos"], n=3)
-    progress.note(f"no photo {photo} has a camera: {neutral}" + (f"; perhaps {', '.join(near)}" if near else ""))
-    return None, neutral
+        return renderer, words
+    if renderer.model is renderer.field:
+        progress.note(f"exposure is not modelled: all photos count as exposed alike, and the video like {photo}")
+        return renderer, words
+    view = next((view for view in scene.views if view.name == photo), None)
+    if view is None:
+        near = difflib.get_close_matches(photo, [view.name for view in scene.views], n=3)
+        progress.note(f"no photo {photo} has a camera: {words}" + (f"; perhaps {', '.join(near)}" if near else ""))
+        return renderer, words
+    as_photo = renderer.through(new_view_like(photo_effects(field, scene, view, renderer.device)))
+    if any(photo in rows for rows in field["effects"].values()):
+        return as_photo, f"exposed like {photo}"
+    progress.note(f"{photo} was not trained on: its exposure is what the photos taken nearest by let expect")
+    return as_photo, f"exposed as expected of {photo}"
 
 
 def _facts(config: Config, path: CameraPath) -> dict[str, Any]:
