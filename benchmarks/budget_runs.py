@@ -92,7 +92,9 @@ def bench_of(workspace: Path) -> Bench:
     test = training_dataset(inputs["ingest"], scene, "test", downscale, Quiet())
     shown_over = torch.tensor(field_background(config, scene))
     probe = make_probe(test, PROBE_RAYS, shown_over, seed=0)
-    return Bench(config, scene, decisions, train, probe, held_out_images(scene.of_split("train"), scene.of_split("test")))
+    return Bench(
+        config, scene, decisions, train, probe, held_out_images(scene.of_split("train"), scene.of_split("test"))
+    )
 
 
 class RunningMean:

@@ -30,7 +30,10 @@ def test_page_says_how_unseen_photos_were_exposed(tmp_path: Path, progress: Any)
     metrics = json.loads(path.read_text("utf-8"))
     write_json(path, metrics | {"appearance": ["exposed as the photos taken nearest by", "darkened"]})
     html, _ = written(inputs, tmp_path / "exposed", progress)
-    assert "Each test photo was rendered exposed as the photos taken nearest by and darkened; nothing was fitted to it" in html
+    assert (
+        "Each test photo was rendered exposed as the photos taken nearest by and darkened; nothing was fitted to it"
+        in html
+    )
 
 
 def test_page_shows_what_fitted_poses_add_apart_from_fitted_exposures(tmp_path: Path, progress: Any):
