@@ -41,7 +41,7 @@ def refined(*seeds: int) -> ImageEffects:
         pose = PoseRefinement(drawn(6, 3, 3))
         pose.turn += 0.3 * drawn(seed, 3, 3)
         pose.offset += 0.3 * drawn(seed + 1, 3, 3)
-        pose.name = f"pose_{seed}"
+        vars(pose)["name"] = f"pose_{seed}"
         effects.append(pose)
     return ImageEffects(tuple(effects))
 

@@ -14,6 +14,7 @@ from stages.effects.decisions import Decisions
 from stages.effects.image_effects import held_out_images, photo_effects
 from stages.effects.pilots import Pilot, PilotScene, pilot_scene, run_pilot
 from stages.io.files import read_scene
+from stages.io.pixels import load_pixels
 from tests.effect_scenes import Effects, effect_scene
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 from tests.synthetic_photos import Quiet
@@ -66,7 +67,7 @@ def test_poses_of_photos_kept_back_are_fitted_wherever_an_arm_refines_poses(
 ) -> None:
     asked: list[bool] = []
 
-    def score(_field: object, _photo: object, poses: bool, _seed: int) -> float:
+    def score(_trained: object, _scene: object, _photo: object, poses: bool, _seed: int) -> float:
         asked.append(poses)
         return 20.0
 
@@ -81,10 +82,10 @@ def test_a_pilot_is_foretold_by_its_steps_and_the_poses_that_it_fits_on_the_cpu(
     inputs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, device: str, fit: float
 ) -> None:
     on = {"cpu": fit, "cuda": 0.02}  # seconds of a step
-    monkeypatch.setattr("stages.hardware.device.compute_device", lambda: device)
-    monkeypatch.setattr("stages.hardware.device.cores", lambda: 16)
-    monkeypatch.setattr("stages.hardware.backend.chosen_backend", lambda _device: "torch")
-    monkeypatch.setattr("stages.train.planning.seconds_per_step", lambda *given: on[given[-1]])
+    monkeypatch.setattr(pilots, "compute_device", lambda: device)
+    monkeypatch.setattr(pilots, "cores", lambda: 16)
+    monkeypatch.setattr(pilots, "chosen_backend", lambda _device: "torch")
+    monkeypatch.setattr(pilots, "seconds_per_step", lambda *given: on[given[-1]])
     scene = read_scene(inputs["normalise"])
     without, fitting = pilots.expected_seconds(scene, 100)
     assert without == pytest.approx(1.3 * 6 * 100 * 0.02)
@@ -173,8 +174,6 @@ def test_the_scenes_photos_are_as_bright_as_they_say(tmp_path: Path) -> None:
     """The helper itself: an exposure effect changes photos by gains within its range, and nothing else does."""
     plain = effect_scene(tmp_path / "plain", Effects(), views=3)
     exposed = effect_scene(tmp_path / "exposed", Effects(exposure_ev=1.0), views=3)
-    from stages.io.pixels import load_pixels
-
     for name in ("000.png", "001.png", "002.png"):
         a, b = (torch.tensor(load_pixels(i["ingest"] / "images" / name, 240, 180)) / 255 for i in (plain, exposed))
         middle = (a > 0.1) & (a < 0.6)
