@@ -48,7 +48,7 @@ def trained(listed: None, tmp_path: Path) -> dict[str, Path]:
     return inputs
 
 
-def test_an_effect_is_its_own_file_and_one_entry_of_the_list(trained: dict[str, Path]) -> None:
+def test_an_effect_is_one_file_and_one_entry(trained: dict[str, Path]) -> None:
     table = json.loads((trained["effects"] / "effects.json").read_text("utf-8"))
     assert table["veil"]["on"] and table["veil"]["statistic"] == 1.0
     rows: Any = effects_table(table)
