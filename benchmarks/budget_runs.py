@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from nerf.effects import HeldOutImages
 from nerf.fields.hash_grid import HashGridField
 from nerf.geometry.scene import Scene
 from nerf.training import hash_grid_trainer
@@ -27,7 +28,8 @@ from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.schedule import new_schedule
 from nerf.training.trainer import FieldTrainer
-from stages.effects.decisions import Decisions, image_effects, read_decisions, told_by_neighbours
+from stages.effects.decisions import Decisions, read_decisions
+from stages.effects.image_effects import held_out_images, image_effects
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.hardware.device import compute_device
 from stages.io.files import read_json, read_scene
@@ -64,8 +66,8 @@ class Bench(NamedTuple):
     scene: Scene
     decisions: Decisions
     dataset: RayDataset
-    probe: EvaluationPixels
-    neighbours: torch.Tensor
+    pixels: EvaluationPixels
+    held_out: HeldOutImages
 
 
 def bench_of(workspace: Path) -> Bench:
@@ -89,8 +91,10 @@ def bench_of(workspace: Path) -> Bench:
     train = guided_dataset(inputs, scene, downscale, Quiet())
     test = training_dataset(inputs["ingest"], scene, "test", downscale, Quiet())
     shown_over = torch.tensor(field_background(config, scene))
-    probe = sample_evaluation_pixels(test, EVALUATION_PIXELS, shown_over, seed=0)
-    return Bench(config, scene, decisions, train, probe, told_by_neighbours(scene, scene.of_split("test")))
+    pixels = sample_evaluation_pixels(test, EVALUATION_PIXELS, shown_over, seed=0)
+    return Bench(
+        config, scene, decisions, train, pixels, held_out_images(scene.of_split("train"), scene.of_split("test"))
+    )
 
 
 class RunningMean:
@@ -128,9 +132,9 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
             for mean in means.values():
                 mean.add(step + 1)
         if step + 1 in due:
-            as_expected = trainer.effects.of_held_out(bench.neighbours)
+            as_expected = trainer.effects.of_held_out(bench.held_out)
             models = {"heldout_psnr": trainer.model} | {name: mean.model for name, mean in means.items()}
-            psnr = {name: evaluate(model, bench.probe, as_expected).psnr for name, model in models.items()}
+            psnr = {name: evaluate(model, bench.pixels, as_expected).psnr for name, model in models.items()}
             points.append({"step": step + 1, "train_psnr": speed, **psnr})
     return {"rays": rays, "pixels": bench.dataset.unmasked_count, "points": points}
 

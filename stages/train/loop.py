@@ -275,7 +275,7 @@ class TrainingRun:
         """Stop if the validation photos reach the target; begin the decay phase if that may be enough; train on if it
         was not and there is time. Revisions already in the schedule are not made again."""
         step, last = self.state.step, self.schedule.revisions[-1]
-        self.state.validation_psnr = round(evaluate_held_out(self.trainer, target.images).psnr, 3)
+        self.state.validation_psnr = round(evaluate_held_out(self.trainer, target.held_out).psnr, 3)
         self.log.event("validated", step, psnr=self.state.validation_psnr)
         if step <= last.from_step or self.state.pending_target(target.psnr) is None:
             return

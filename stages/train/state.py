@@ -10,7 +10,7 @@ from stages.contract import StageError
 
 if TYPE_CHECKING:
     from nerf.training.evaluation_pixels import EvaluationPixels
-    from stages.train.validation_images import HeldOutImages, Target
+    from stages.train.validation_images import HeldOutEvaluation, Target
 
 SPEED_AVERAGING_SECONDS = 5.0  # of the speed and the batch PSNR that are shown
 # Between checkpoints, at most; of a run in seconds a twentieth of them, but saving takes no more than a hundredth.
@@ -32,7 +32,7 @@ class EvaluationSets(NamedTuple):
     None without any), and of validation photos with a ``target`` at which to stop."""
 
     train: "EvaluationPixels"
-    test: "HeldOutImages | None" = None
+    test: "HeldOutEvaluation | None" = None
     target: "Target | None" = None
 
 

@@ -11,7 +11,8 @@ from nerf.training.evaluation_pixels import sample_evaluation_pixels
 from nerf.training.ray_dataset import RayDataset
 from stages.amounts import short_count
 from stages.contract import Inputs, Progress, StageResult
-from stages.effects.decisions import image_effects, learnt_of_photos, read_decisions
+from stages.effects.decisions import read_decisions
+from stages.effects.image_effects import image_effects, learnt_effects
 from stages.hardware.device import compute_device, cores
 from stages.hardware.memory import check_memory
 from stages.io.field_files import save_field
@@ -37,7 +38,7 @@ from stages.train.validation_images import (
     EVALUATION_PIXELS,
     EVALUATION_SEED,
     Target,
-    held_out_images,
+    held_out_evaluation,
     with_validation_split,
 )
 
@@ -85,10 +86,10 @@ def prepare(config: Config, scene: Scene, inputs: Inputs, folder: Path, progress
 
     evaluation_sets = EvaluationSets(
         sample_evaluation_pixels(dataset, EVALUATION_PIXELS, background, EVALUATION_SEED),
-        held_out_images(config, inputs["ingest"], scene, "test", device, progress),
+        held_out_evaluation(config, inputs["ingest"], scene, "test", device, progress),
     )
     if config.target_psnr is not None:
-        validation = held_out_images(config, inputs["ingest"], scene, "validation", device, progress)
+        validation = held_out_evaluation(config, inputs["ingest"], scene, "validation", device, progress)
         assert validation is not None, "load() makes some"
         evaluation_sets = evaluation_sets._replace(target=Target(config.target_psnr, validation))
     budget = budget_of(config, inputs)
@@ -130,7 +131,7 @@ def save(training: Training, folder: Path, progress: Progress) -> StageResult:
     assert config.downscale is not None, "plan() chooses it"
     info = {"downscale": config.downscale, "steps": run.state.step, "rays": run.state.rays}
     info["background"] = list(field_background(config, scene))
-    info |= learnt_of_photos(run.trainer, scene.of_split("train"))
+    info["effects"] = learnt_effects(run.trainer.effects, scene.of_split("train"))
     save_field(folder, run.trainer.model, info)
     write_curve(folder, config.kind, config.downscale, run.schedule.is_single_cycle, run.state.curve)
     progress.update("measuring what this machine can do")

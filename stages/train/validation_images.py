@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
+from nerf.effects import HeldOutImages
 from nerf.geometry.scene import Scene, Split
 from nerf.training.evaluation_pixels import (
     EvaluationPatches,
@@ -18,7 +18,7 @@ from nerf.training.evaluation_pixels import (
 )
 from nerf.training.trainer import FieldTrainer
 from stages.contract import Progress, StageError
-from stages.effects.decisions import told_by_neighbours
+from stages.effects.image_effects import held_out_images
 from stages.evaluate.image_metrics import ssim
 from stages.io.photos import spread
 from stages.train.config import Config
@@ -34,19 +34,19 @@ MIN_TRAINING_PHOTOS = 4  # as long as so many are left to train on
 MAX_VALIDATION_PHOTOS = 8  # for a target PSNR
 
 
-class HeldOutImages(NamedTuple):
-    """Pixels and patches of held-out photos, and per photo the weights of the training photos nearest to it."""
+class HeldOutEvaluation(NamedTuple):
+    """Pixels and patches of held-out photos, and these photos beside the training photos."""
 
     pixels: EvaluationPixels
     patches: EvaluationPatches
-    neighbour_weights: Tensor
+    images: HeldOutImages
 
 
 class Target(NamedTuple):
     """PSNR (dB) to be reached on validation photos."""
 
     psnr: float
-    images: HeldOutImages
+    held_out: HeldOutEvaluation
 
 
 class HeldOutQuality(NamedTuple):
@@ -56,9 +56,9 @@ class HeldOutQuality(NamedTuple):
     ssim: float | None
 
 
-def held_out_images(
+def held_out_evaluation(
     config: Config, ingest: Path, scene: Scene, split: Split, device: str, progress: Progress
-) -> HeldOutImages | None:
+) -> HeldOutEvaluation | None:
     """Of the photos of a split, always the same pixels. None if there are none, or if masks leave nothing of the test
     photos, which decide nothing: then with a note."""
     if not scene.of_split(split):
@@ -72,10 +72,10 @@ def held_out_images(
         progress.note(f"held-out quality is not measured while training: {error.why}")
         return None
     background = torch.tensor(field_background(config, scene), device=device)
-    return HeldOutImages(
+    return HeldOutEvaluation(
         sample_evaluation_pixels(dataset, EVALUATION_PIXELS, background, EVALUATION_SEED),
         sample_evaluation_patches(dataset, EVALUATION_PATCHES, PATCH_SIZE, background, EVALUATION_SEED),
-        told_by_neighbours(scene, scene.of_split(split)),
+        held_out_images(scene.of_split("train"), scene.of_split(split), device),
     )
 
 
@@ -85,11 +85,11 @@ def load_metrics() -> None:
     import kornia.metrics  # noqa: F401
 
 
-def evaluate_held_out(trainer: FieldTrainer, images: HeldOutImages) -> HeldOutQuality:
+def evaluate_held_out(trainer: FieldTrainer, held_out: HeldOutEvaluation) -> HeldOutQuality:
     """Quality on held-out photos, with the exposure expected from their neighbours."""
-    effects = trainer.effects.of_held_out(images.neighbour_weights)
-    psnr = evaluate(trainer.model, images.pixels, effects).psnr
-    rows = zip(*render_patches(trainer.model, images.patches, effects), images.patches.used, strict=True)
+    effects = trainer.effects.of_held_out(held_out.images)
+    psnr = evaluate(trainer.model, held_out.pixels, effects).psnr
+    rows = zip(*render_patches(trainer.model, held_out.patches, effects), held_out.patches.used, strict=True)
     known = [value for row in rows if (value := ssim(*(part.cpu() for part in row))) is not None]
     return HeldOutQuality(psnr, sum(known) / len(known) if known else None)
 

@@ -43,8 +43,8 @@ ELSEWHERE = {
     "tests/nerf/effects/test_pose_refinement.py; the fit of one is a search: tests/nerf/effects/test_pose_fit.py",
     "nerf/geometry/pose_distance.py": "float64, ratios of distances: tests/nerf/geometry/test_pose_distance.py",
     "nerf/rendering/images.py": "cuts pictures into chunks: tests/nerf/rendering/test_images.py",
-    "nerf/training/validation_probe.py": "mean colour, PSNR, patches of pixels: "
-    "tests/nerf/training/test_validation_probe.py",
+    "nerf/training/evaluation_pixels.py": "mean colour, PSNR, patches of pixels: "
+    "tests/nerf/training/test_evaluation_pixels.py",
     "nerf/training/trainer.py": "a pixel over its background, linear in alpha: "
     "tests/nerf/training/test_vanilla_trainer.py",
     "nerf/training/vanilla_trainer.py": "sums of chunks; refuses what is not finite before the update: "

@@ -8,14 +8,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nerf.effects import NO_EFFECTS
+from nerf.effects import NO_EFFECTS, HeldOutImages, Images
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from nerf.training.evaluation_pixels import EvaluationPatches, EvaluationPixels
 from nerf.training.trainer import StepResult
 from stages.train.loop import TrainingRun
 from stages.train.state import EvaluationSets, TrainingBudget, TrainingLog
-from stages.train.validation_images import HeldOutImages, Target
+from stages.train.validation_images import HeldOutEvaluation, Target
 
 
 class Killed(BaseException):
@@ -75,9 +75,11 @@ def pixels() -> EvaluationPixels:
     return EvaluationPixels(rays, torch.tensor([[0.0] * 3, [0.5] * 3]), torch.zeros(3), torch.tensor([0, 1]))
 
 
-def held_out() -> HeldOutImages:
+def held_out() -> HeldOutEvaluation:
     """The same rays; their patches are too small for SSIM."""
-    return HeldOutImages(pixels(), EvaluationPatches(pixels(), torch.ones(2, 1, 1, dtype=torch.bool)), torch.eye(2))
+    photos = HeldOutImages(Images(torch.zeros(2, 3, 4)), torch.eye(2))
+    patches = EvaluationPatches(pixels(), torch.ones(2, 1, 1, dtype=torch.bool))
+    return HeldOutEvaluation(pixels(), patches, photos)
 
 
 def run_in(

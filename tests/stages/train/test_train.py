@@ -20,7 +20,7 @@ from stages.train import Config
 from stages.train.config import GRID_ONLY, PAPER_ONLY
 from stages.train.fields.hash_grid import LEARNING_RATES
 from stages.train.training import prepare
-from stages.train.validation_images import held_out_images, with_validation_split
+from stages.train.validation_images import held_out_evaluation, with_validation_split
 from tests.refusals import refused
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 
@@ -179,11 +179,11 @@ def test_test_photos_of_which_masks_leave_nothing_stop_no_training(tmp_path: Pat
     dot[4, 4] = 255
     inputs, masked = photographed(tmp_path, mask=dot)
     config = Config(downscale=2.0)
-    assert held_out_images(config, inputs["ingest"], masked, "test", "cpu", progress) is None
+    assert held_out_evaluation(config, inputs["ingest"], masked, "test", "cpu", progress) is None
     why = "the masks ignore every pixel of the test photos at this size"
     assert progress.notes == [f"held-out quality is not measured while training: {why}"]
     with refused("train.all-masked"):
-        held_out_images(config, inputs["ingest"], with_validation_split(masked), "validation", "cpu", progress)
+        held_out_evaluation(config, inputs["ingest"], with_validation_split(masked), "validation", "cpu", progress)
 
 
 def test_two_budgets_are_refused_in_words() -> None:
@@ -304,7 +304,7 @@ def test_every_seed_is_measured_on_the_same_pixels(tmp_path: Path, progress) -> 
         config = train.plan(Config(**TINY, steps=1, seed=seed, target_psnr=20.0), inputs, progress)
         evaluation_sets = prepare(config, scene, inputs, folder, progress).evaluation_sets
         assert evaluation_sets.test and evaluation_sets.target
-        held_out = (evaluation_sets.test, evaluation_sets.target.images)
+        held_out = (evaluation_sets.test, evaluation_sets.target.held_out)
         others = (pixels for each in held_out for pixels in (each.pixels, each.patches.pixels))
         found.append([pixels.colours for pixels in (evaluation_sets.train, *others)])
     assert len(found[0]) == 5 and all(torch.equal(*pair) for pair in zip(*found, strict=True))
