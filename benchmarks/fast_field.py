@@ -77,7 +77,7 @@ def frame_seconds(workspace: Path, width: int) -> tuple[float, str]:
     seconds = []
     for _ in range(2):
         started = time.perf_counter()
-        renderer.draw(rays)
+        renderer.render(rays)
         seconds.append(time.perf_counter() - started)
     return min(seconds), "×".join(map(str, reversed(rays.near.shape)))
 

@@ -115,24 +115,24 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
 def _affordable(config: Config, scene: "Scene", train: Path, may_shrink: bool, progress: Progress) -> Config:
     """``config`` with the number of photos that there is time for, and where it must and ``may_shrink``, a smaller
     size."""
-    from stages.render.renderer import Allowance, measured_speed
+    from stages.render.renderer import TimeBudget, measured_speed
     from stages.train.data import scaled_size
 
     assert config.downscale is not None
     test = scene.of_split("test")
-    allowance = Allowance(config.seconds, train, BESIDE_DRAWING * len(scene.views))
+    time_budget = TimeBudget(config.seconds, train, BESIDE_DRAWING * len(scene.views))
     cameras = [scene.cameras[view.camera] for view in test]
     drawings = DRAWINGS_TO_FIT if fits_poses(config, read_json(train / "field.json")) else 1
     pixels = [drawings * math.prod(scaled_size(camera, config.downscale)) for camera in cameras]
-    progress.update("trying how fast the field draws")
+    progress.update("measuring rendering speed")
     largest = max(1, int(min(max(c.width, c.height) for c in cameras) / config.downscale))
     speed = measured_speed(train, lambda side: _tried_rays(scene, side), largest)
-    budget = allowance.left() * speed
+    budget = time_budget.seconds_left() * speed
     chosen = affordable(pixels, budget)  # one at least: only one where that takes too long
     if len(chosen) < len(test):
         progress.note(
             f"{short_count(speed)} rays/s here: all {len(test)} test photos take about "
-            f"{duration(sum(pixels) / speed)}, {allowance.words()}; --evaluate.photos asks for more"
+            f"{duration(sum(pixels) / speed)}, {time_budget.message()}; --evaluate.photos asks for more"
         )
     downscale, one = config.downscale, pixels[chosen[0]]
     smallest = max(cameras[chosen[0]].width, cameras[chosen[0]].height) / MIN_SIDE
@@ -140,7 +140,7 @@ def _affordable(config: Config, scene: "Scene", train: Path, may_shrink: bool, p
     if may_shrink and saved > 0 and smallest > downscale:
         downscale = min(math.ceil(100 * downscale * math.sqrt(one / budget)) / 100, smallest)
         progress.note(
-            f"a test photo takes about {duration(one / speed)}, {allowance.words()}: it is scored at "
+            f"a test photo takes about {duration(one / speed)}, {time_budget.message()}: it is scored at "
             f"{1 / downscale:.0%} of its width; --evaluate.downscale {config.downscale:g} asks for more"
         )
     return config.model_copy(update={"photos": len(chosen), "downscale": downscale})
@@ -225,7 +225,7 @@ class Examiner:
         from stages.train.data import view_rays
 
         truth, used = self._photo(view), self.used(view)
-        rendering = self._renderer(view).draw(view_rays(self.scene, view, self.downscale), on_chunk)
+        rendering = self._renderer(view).render(view_rays(self.scene, view, self.downscale), on_chunk)
         image = rendering.colour.clamp(0, 1)
         background = self.renderer.background.cpu()
         right, fitted = right_half_psnr(rendering, background, truth, used)
@@ -262,10 +262,10 @@ class Examiner:
         field = self.renderer.field
         assert isinstance(field, HashGridField), "only with a hash-grid field does evaluate fit poses"
         rays = view_rays(self.scene, view, self.downscale)
-        rendering, effects = self._renderer(view).draw(rays), photo_effects(self.field, self.scene, view)
+        rendering, effects = self._renderer(view).render(rays), photo_effects(self.field, self.scene, view)
         background = self.renderer.background.cpu()
         moved = from_fitted_pose(field.on_cpu(), rays, rendering, background, truth, used, effects)
-        return self._renderer(view).draw(moved)
+        return self._renderer(view).render(moved)
 
     @cached_property
     def _reader(self) -> "PhotoReader":
