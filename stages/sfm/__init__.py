@@ -18,7 +18,7 @@ from stages.io.files import write_json
 from stages.sfm.pairs import Matcher
 
 INPUTS = ("ingest",)
-VERSION = 16
+VERSION = 17
 EXIT_CODE = 11
 RESUMES = True
 PUBLISHED = ("sparse", "registration.json")
