@@ -170,15 +170,16 @@ def check_poses(matches: PairMatches, world_from_camera: Float[np.ndarray, "phot
     The groups are the sides of weak cuts of the graph of agreeing pairs: a group that was moved as a whole agrees
     within, and hardly across. A group is misplaced if more matches across contradict than agree.
     """
-    count = len(world_from_camera)
-    error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera))
+    count, nowhere = len(world_from_camera), np.zeros(len(matches.pairs), bool)
+    error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, nowhere))
+    misplaced = _misplaced(*_votes(matches, error, _tolerance_px(error, matches.weight)[1], count))
+    error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, _trusted(matches, misplaced)))
     median, tolerance = _tolerance_px(error, matches.weight)
     support, against = _votes(matches, error, tolerance, count)
     misplaced = _misplaced(support, against)
     # Depths that a misplaced group got wrong count against good photos beside it: these are checked again without.
     for _ in range(MAX_RECHECKS if misplaced.any() else 0):
-        trusted = ~misplaced[matches.pairs].any(axis=1) & (matches.weight >= MIN_PAIR_MATCHES)
-        error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, trusted))
+        error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, _trusted(matches, misplaced)))
         support, against = _votes(matches, error, tolerance, count)
         cleared = misplaced & ((support - against)[:, ~misplaced].sum(axis=1) > 0)
         if not cleared.any():
@@ -201,6 +202,11 @@ def check_poses(matches: PairMatches, world_from_camera: Float[np.ndarray, "phot
         votes_for=support[:, passed].sum(axis=1),
         votes_against=against[:, passed].sum(axis=1),
     )
+
+
+def _trusted(matches: PairMatches, misplaced: Bool[np.ndarray, "photos"]) -> Bool[np.ndarray, "pairs"]:
+    """The pairs that may tell depths: enough matches not to be chance, of photos that are not misplaced."""
+    return ~misplaced[matches.pairs].any(axis=1) & (matches.weight >= MIN_PAIR_MATCHES)
 
 
 def agreement(matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"]) -> tuple[int, int]:
