@@ -74,11 +74,10 @@ def run_mapping(
 
 def _comparison(model: Any, other: Any, database: Path, state: JobState) -> dict[str, Any]:
     """How the model of global mapping compares, and where it differs, how many verified pairs agree with either."""
-    compared = compare_models(model, other) | {"failed": None, "agreeing": None, "agreeing_global": None}
-    if files := set(compared["different"]):
-        agreeing, agreeing_global = (agreeing_pairs(one, database, state.job.seed, files) for one in (model, other))
-        compared |= {"agreeing": agreeing, "agreeing_global": agreeing_global}
-    return compared
+    compared = compare_models(model, other)
+    files, seed = set[str](compared["different"]), state.job.seed
+    support = [agreeing_pairs(one, database, seed, files) if files else None for one in (model, other)]
+    return compared | {"failed": None, "agreeing": support[0], "agreeing_global": support[1]}
 
 
 def _start_global_mapping(strategy: Strategy, database: Path, state: JobState) -> "global_mapping.Started | None":

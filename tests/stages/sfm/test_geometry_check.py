@@ -139,7 +139,7 @@ def test_a_single_pair_across_is_a_weak_link() -> None:
     assert check.passed.all() and link.photos == list(range(7)) and link.pairs == 1
 
 
-def test_chance_matches_do_not_cut_off_a_photo_that_one_pair_holds() -> None:
+def test_chance_matches_cut_off_no_photo() -> None:
     """They have no more than verification lets pass, and would tell wrong depths of what the right pair sees."""
     matches, poses = walk()
     random, last = np.random.default_rng(3), 29
