@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from nerf.geometry.rays import Rays, rays_of_view
+from nerf.geometry.space_maps import Box, Contraction, SpaceMap
 from nerf.training.ray_dataset import PosedViews, RayDataset, make_ray_dataset
 from nerf.training.trainer import over
 from stages.contract import Inputs, Progress, StageError
@@ -183,6 +184,11 @@ def field_background(config: Config, scene: "Scene") -> tuple[float, float, floa
     """What the finished field is shown over, unless it has a background model. Photos without alpha fill every ray;
     what a field without one leaves open is black, as published."""
     return WHITE if scene.has_alpha and config.background != "black" else BLACK
+
+
+def space_of(config: Config) -> SpaceMap:
+    """How the scene fills the cube of the field."""
+    return Contraction() if config.contracted else Box()
 
 
 def has_background_model(config: Config, scene: "Scene") -> bool:
