@@ -13,6 +13,7 @@ from stages.effects import pilots
 from stages.effects.decisions import Decisions, expected_gains, told_by_neighbours
 from stages.effects.pilots import Pilot, PilotScene, pilot_scene, run_pilot
 from stages.io.files import read_scene
+from stages.io.pixels import load_pixels
 from tests.effect_scenes import Effects, effect_scene
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 from tests.synthetic_photos import Quiet
@@ -60,7 +61,7 @@ def test_a_wrong_exposure_loses(trial: PilotScene) -> None:
         (PLAIN.without("view_dependence"), PLAIN, False),
     ],
 )
-def test_poses_of_photos_kept_back_are_fitted_wherever_an_arm_refines_poses(
+def test_validation_poses_are_fitted_wherever_poses_are_refined(
     trial: PilotScene, monkeypatch: pytest.MonkeyPatch, off: Decisions, on: Decisions, fitted: bool
 ) -> None:
     asked: list[bool] = []
@@ -76,7 +77,7 @@ def test_poses_of_photos_kept_back_are_fitted_wherever_an_arm_refines_poses(
 
 
 @pytest.mark.parametrize(("device", "fit"), [("cpu", 0.02), ("cuda", 0.5)])
-def test_a_pilot_is_foretold_by_its_steps_and_the_poses_that_it_fits_on_the_cpu(
+def test_pilots_are_predicted_by_steps_and_fitted_poses(
     inputs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, device: str, fit: float
 ) -> None:
     on = {"cpu": fit, "cuda": 0.02}  # seconds of a step
@@ -108,7 +109,7 @@ def test_too_few_photos_make_no_pilot(tmp_path: Path) -> None:
     ],
     ids=["a dot", "a small square"],
 )
-def test_photos_of_which_masks_leave_too_little_at_its_size_make_no_pilot(
+def test_heavily_masked_photos_make_no_pilot(
     left: tuple, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pilots, "LONG_SIDE", WIDTH // 2)
@@ -125,7 +126,7 @@ def test_what_pays_is_more_than_noise_and_than_nothing(gain: float, noise: float
     assert Pilot(gain, noise, 0.0).pays is pays
 
 
-def test_noise_is_that_of_seeds_or_of_photos_whichever_is_more() -> None:
+def test_noise_is_the_larger_of_seeds_and_photos() -> None:
     student = 4.303 / 3**0.5  # 97.5 % for three, over the root of how many
     assert pilots._noise([[1.0] * 3, [3.0] * 3, [2.0] * 3]) == pytest.approx(student, rel=1e-3)
     assert pilots._noise([[1.0, 5.0, 3.0]] * 3) == pytest.approx(2 * student, rel=1e-3)
@@ -170,8 +171,6 @@ def test_the_scenes_photos_are_as_bright_as_they_say(tmp_path: Path) -> None:
     """The helper itself: an exposure effect changes photos by gains within its range, and nothing else does."""
     plain = effect_scene(tmp_path / "plain", Effects(), views=3)
     exposed = effect_scene(tmp_path / "exposed", Effects(exposure_ev=1.0), views=3)
-    from stages.io.pixels import load_pixels
-
     for name in ("000.png", "001.png", "002.png"):
         a, b = (torch.tensor(load_pixels(i["ingest"] / "images" / name, 240, 180)) / 255 for i in (plain, exposed))
         middle = (a > 0.1) & (a < 0.6)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from hypothesis import given
@@ -48,7 +49,7 @@ def taken(path: Path, folder: Path, progress: Any, most: int = 300) -> list[Take
     return take_frames(path, most, folder, progress)
 
 
-def test_frames_are_steps_of_the_picture_apart_and_a_pause_gives_one(tmp_path: Path, progress: Any) -> None:
+def test_frames_are_picture_steps_apart_and_pauses_one(tmp_path: Path, progress: Any) -> None:
     ways = [*[0.0] * 8, *np.arange(1, 41) / 50, *[0.8] * 8]
     frames = taken(clip(tmp_path / "a.mp4", panned(*ways)), tmp_path / "out", progress)
     steps = np.diff([ways[frame.number] for frame in frames])
@@ -114,8 +115,6 @@ def test_the_same_video_gives_the_same_bytes(threads: int, tmp_path: Path, progr
 
 @pytest.mark.parametrize(("turn", "quarters"), [(90, 1), (180, 2), (270, 3)])
 def test_a_turned_video_stands_upright(turn: int, quarters: int, tmp_path: Path, progress: Any) -> None:
-    import imageio_ffmpeg
-
     pictures = panned(*np.arange(6) / 6)
     stored, turned = clip(tmp_path / "a.mp4", pictures), tmp_path / "b.mp4"
     ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-display_rotation", str(turn)]
@@ -137,8 +136,6 @@ def test_a_turned_video_stands_upright(turn: int, quarters: int, tmp_path: Path,
     ],
 )
 def test_pixels_become_square(aspect: str, turn: int, size: tuple[int, int], tmp_path: Path, progress: Any) -> None:
-    import imageio_ffmpeg
-
     pictures = panned(*np.arange(6) / 6)
     square, stored = clip(tmp_path / "a.mp4", pictures), tmp_path / "b.mp4"
     ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-display_rotation", str(turn), "-i", str(square)]
@@ -244,5 +241,5 @@ def test_a_video_whose_end_is_missing_is_said(tmp_path: Path, progress: Any) -> 
 
 
 @pytest.mark.parametrize(("decoded", "announced", "lacks"), [(29, 30, False), (27, 30, True), (985, 1000, False)])
-def test_a_whole_video_may_count_a_frame_or_two_too_many(decoded: int, announced: int, lacks: bool) -> None:
+def test_a_whole_video_may_announce_two_frames_too_many(decoded: int, announced: int, lacks: bool) -> None:
     assert lacks_frames(decoded, announced) == lacks

@@ -20,6 +20,7 @@ from stages.contract import StageError
 from stages.io.files import read_json, write_json
 from stages.io.transforms_export import transforms
 from stages.render.path import CameraPath, fitted_path, median_camera, path_from_file, path_rays, resized
+from stages.render.video import STARTING_SECONDS
 from tests.camera_layouts import ring, wall
 from tests.refusals import refused
 from tests.video_files import read_video
@@ -74,7 +75,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     monkeypatch.setattr(
         "stages.render.renderer.Renderer.rays_per_second", lambda self, sample, largest, seconds: 30_000
     )
-    monkeypatch.setattr("stages.io.field_files.load_field", lambda *_: (Ball(), info))
+    monkeypatch.setattr("stages.render.renderer.load_field", lambda *_: (Ball(), info))
     return folders
 
 
@@ -135,7 +136,7 @@ def test_depth_waits_on_the_disk_only_where_it_is_shown(inputs, progress, monkey
         yield lambda frame: waiting.append((path.parent / "inverse_depth.tmp").exists())
 
     waiting = list[bool]()
-    monkeypatch.setattr("stages.io.video.video_writer", writer)
+    monkeypatch.setattr("stages.render.video.video_writer", writer)
     run(inputs, progress, frames=3, width=40, depth=depth)
     assert waiting == (6 * [True] if depth else 3 * [False])
     assert not (inputs["render"] / "inverse_depth.tmp").exists()
@@ -222,7 +223,7 @@ def test_a_written_path_can_be_given_back_as_cameras(inputs, progress, tmp_path:
     assert np.abs(frames.astype(int) - read_video(tmp_path / "first.mp4")[0]).mean() < 1
 
 
-def test_bearings_are_made_frame_by_frame_and_kept_while_the_lens_is_the_same(monkeypatch) -> None:
+def test_ray_directions_are_made_per_frame_and_lens(monkeypatch) -> None:
     """500 lenses at full size would be 12 GB."""
     made = []
 
@@ -230,7 +231,7 @@ def test_bearings_are_made_frame_by_frame_and_kept_while_the_lens_is_the_same(mo
         made.append((camera.params[0], weakref.ref(rays := np.zeros((height, width, 3), np.float32))))
         return rays
 
-    monkeypatch.setattr("stages.sfm.colmap.cameras.camera_rays", camera_rays)
+    monkeypatch.setattr("stages.render.path.camera_rays", camera_rays)
     lenses = [replace(CAMERA, params=(focal, *CAMERA.params[1:])) for focal in (150.0, 150.0, 151.0, 152.0)]
     frames = path_rays(CameraPath(tuple(lenses), ring(4)), scene_with(ring(5)))
     asked = []
@@ -261,7 +262,7 @@ def test_a_fisheye_lens_and_a_third_radial_term_are_understood(tmp_path: Path) -
     assert (fisheye.model, fisheye.params[4:]) == ("OPENCV_FISHEYE", (0, 0, 0.01, 0))
 
 
-def test_a_blender_camera_angle_is_understood_and_missing_sizes_are_the_photos(tmp_path: Path) -> None:
+def test_blender_angles_are_understood_without_sizes(tmp_path: Path) -> None:
     frame = {"file_path": "r_0", "transform_matrix": np.eye(4).tolist()}
     camera = given_path({"camera_angle_x": np.pi / 2, "frames": [frame]}, scene_with(ring(5)), tmp_path).cameras[0]
     assert (camera.model, camera.width, camera.height) == ("PINHOLE", 160, 120)
@@ -295,7 +296,7 @@ def test_frames_of_different_size_make_no_video(tmp_path: Path) -> None:
         given_path({"frames": [frame, frame | {"w": 10, "h": 10}]}, scene_with(ring(5)), tmp_path)
 
 
-def test_the_median_camera_has_no_distortion_and_the_photos_angle_of_view() -> None:
+def test_the_median_camera_keeps_the_angle_of_view() -> None:
     scene = scene_with(ring(5))
     camera = median_camera(scene)
     assert camera == Camera("PINHOLE", 160, 120, (150.0, 150.0, 80.0, 60.0))
@@ -313,7 +314,7 @@ def test_the_median_camera_has_no_distortion_and_the_photos_angle_of_view() -> N
         ([(100, 80), (100, 80), (400, 301), (404, 300), (410, 300)], (100, 80)),
     ],
 )
-def test_the_median_camera_has_the_usual_size_or_the_median_of_those_that_are_equally_usual(sizes, size) -> None:
+def test_the_median_camera_has_the_usual_size(sizes, size) -> None:
     cameras = [Camera("PINHOLE", w, h, (150.0, 150.0, w / 2, h / 2)) for w, h in sizes]
     scene = scene_with(ring(1 + len(sizes)))  # the first is a test photo
     views = [replace(view, camera=max(0, index - 1)) for index, view in enumerate(scene.views)]
@@ -344,7 +345,7 @@ def with_exposure(inputs, monkeypatch) -> None:
     info = read_json(inputs["train"] / "field.json") | {"exposure": {"neutral": [0.0] * 3, "photos": photos}}
     write_json(inputs["train"] / "field.json", info)
     shown = AppearanceModel(GreyBall(), (ExposureModel(torch.zeros(1, 3)),))
-    monkeypatch.setattr("stages.io.field_files.load_field", lambda *_: (shown, info))
+    monkeypatch.setattr("stages.render.renderer.load_field", lambda *_: (shown, info))
 
 
 class GreyBall(Ball):
@@ -383,7 +384,7 @@ def test_a_field_without_exposure_says_nothing_of_it(inputs, progress) -> None:
         ("lark.jpg", 0.5, NEUTRAL, f"no photo lark.jpg has a camera: {NEUTRAL}; perhaps dark.jpg"),
     ],
 )
-def test_a_photo_without_exposure_of_its_own_is_no_error_after_the_training(
+def test_missing_exposure_is_no_error_after_training(
     inputs, progress, monkeypatch, like: str, level: float, exposure: str, note: str
 ) -> None:
     with_exposure(inputs, monkeypatch)
@@ -398,5 +399,5 @@ def test_seconds_given_bound_the_video_whatever_training_took(inputs, progress, 
     config = render.plan(render.Config(seconds=seconds), inputs, progress)
     assert config.frames is not None and config.width is not None
     expected = config.frames * config.width**2 * 0.75 / 30_000
-    assert 0.4 * (seconds - render.STARTING_SECONDS) < expected < seconds
+    assert 0.4 * (seconds - STARTING_SECONDS) < expected < seconds
     assert f"given {seconds:g} s" in progress.notes[0].replace("1 min", "60 s")

@@ -1,6 +1,7 @@
 from unittest.mock import Mock
 
 import numpy as np
+import pycolmap
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -57,8 +58,6 @@ def test_it_is_how_far_poses_spread_over_repeated_noise() -> None:
 
 
 def test_it_does_not_depend_on_where_the_world_is() -> None:
-    import pycolmap
-
     model = photographed(CAMERA, photos=PHOTOS, points=POINTS)
     here = pose_uncertainty_px(model, 0.5)
     rotation = pycolmap.Rotation3d(Rotation.from_rotvec([0.5, -1.0, 2.0]).as_quat())
@@ -94,9 +93,7 @@ def test_mismatches_count_by_their_pull() -> None:
 
 
 @pytest.mark.parametrize("how", ["foreseen", "met"])
-def test_where_there_is_no_room_for_it_that_is_said_and_the_model_stands(
-    how: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lack_of_room_is_told_and_the_model_stands(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     model = photographed(CAMERA, photos=PHOTOS, points=POINTS)
     room = 6 * (6 * PHOTOS) ** 2 * 8
     monkeypatch.setattr(uncertainty, "available_bytes", lambda: room)
