@@ -107,7 +107,7 @@ def test_packed_distances_are_those_of_their_rays() -> None:
     torch.testing.assert_close(mapped.to_scene(t[ray], ray), mapped.to_scene(t[:, None])[ray, 0])
 
 
-def test_a_ray_starts_at_the_near_plane_wherever_it_comes_from() -> None:
+def test_rays_start_at_the_near_plane() -> None:
     """From before the near plane, from behind the apex, and where it looks back: nothing, or up to the plane."""
     forward = torch.tensor(TURNED[2], dtype=torch.float64)
     origins = torch.stack([scene_point(0, 0, depth) for depth in (0.4, -3.0, 2.0, 0.4, 2.0)])
@@ -145,7 +145,7 @@ def test_lengths_in_the_scene_are_the_slope_of_distances() -> None:
     torch.testing.assert_close(mapped.to_scene(t, ray), mapped.to_scene(mapped.rays.far[:, None] * 0.7)[ray, 0])
 
 
-def test_lengths_at_a_point_are_those_along_its_line_of_sight() -> None:
+def test_lengths_at_points_are_those_along_lines_of_sight() -> None:
     points = inside(NDC, 50)
     towards = points - torch.tensor(APEX).double()
     towards /= towards.norm(dim=-1, keepdim=True)
