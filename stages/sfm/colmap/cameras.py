@@ -64,7 +64,7 @@ def no_ray(camera: Camera, share: float, of: str = "") -> StageError:
         "sfm.no-ray",
         f"the {camera.model} camera{f' of {of!r}' * bool(of)} has no ray for {100 * share:.3g}% of its pixels",
         f"{why_no_ray(camera.model)} there (parameters {', '.join(f'{p:.5g}' for p in camera.params)})",
-        f"Check the distortion of the given cameras, or {other}.",
+        f"Check the distortion of the imported cameras, or {other}.",
     )
 
 
