@@ -1,7 +1,7 @@
 """One optimisation step of a hash-grid field (:class:`nerf.training.trainer.FieldTrainer`)."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from typing import Literal, NamedTuple
@@ -60,7 +60,7 @@ class HashGridTrainerSettings:
     colour behind a scene without a background model, or another random one for each ray (only for photos with alpha,
     where it shows the field which space is empty). ``distortion_weight``: full weight of the distortion loss, for
     scenes without a known background. ``depth_weight``: initial weight of the sparse depth loss. ``min_photos``: how
-    many photos must see a cell of contracted space before their foregrounds for it to hold density
+    many photos must see a cell of unbounded space before their foregrounds for it to hold density
     (nerf/fields/frustum_mask.py), or all but one where they are few.
     """
 
@@ -146,7 +146,7 @@ class HashGridTrainer:
     ) -> None:
         self.model, self.settings, self.effects = model, settings, effects
         # Nothing beyond the box of a bounded scene is rendered: a point there would pull density to its walls.
-        self.dataset = dataset if model.settings.contracted else dataset.with_sparse_depths_within(BOX)
+        self.dataset = dataset if model.space.unbounded else dataset.with_sparse_depths_within(BOX)
         self.occupancy_grid = OccupancyGrid(model, self._frustum_mask())
         networks = model.weights._asdict()
         self.background = {"background_table": model.background_table} if model.settings.background_model else {}
@@ -163,11 +163,11 @@ class HashGridTrainer:
         self.pixels_sampled = torch.tensor(0)  # so far; steps differ in how many they take
 
     def _frustum_mask(self) -> Bool[Tensor, "cells"] | None:
-        """Only in contracted space and with sparse points, which tell where foregrounds begin; else None."""
-        min_photos, stepping = min(self.settings.min_photos, len(self.dataset.near) - 1), self.model.stepping
-        if min_photos <= 1 or self.dataset.sparse_pixels is None or not stepping.contracted:
+        """Only in unbounded space and with sparse points, which tell where foregrounds begin; else None."""
+        min_photos, space = min(self.settings.min_photos, len(self.dataset.near) - 1), self.model.space
+        if min_photos <= 1 or self.dataset.sparse_pixels is None or not space.unbounded:
             return None
-        return compute_frustum_mask(self.dataset, min_photos, stepping.occupancy_resolution)
+        return compute_frustum_mask(self.dataset, space, min_photos, self.model.stepping.occupancy_resolution)
 
     def step(self, step: int, progress: float, lr_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
@@ -196,7 +196,7 @@ class HashGridTrainer:
             | {f"exp_avg_sq.{name}": tensor for name, tensor in self.exp_avg_sq.items()}
             | {"optical_thickness": self.occupancy_grid.optical_thickness}
             | {"samples_per_ray": self.samples_per_ray, "pixels_sampled": self.pixels_sampled}
-            | {"settings": torch.tensor(astuple(self.model.settings), dtype=torch.float64)}
+            | {"settings": torch.frombuffer(bytearray(repr(self.model.settings).encode()), dtype=torch.uint8)}
         )
 
     def load_state(self, state: dict[str, Tensor]) -> None:
@@ -288,20 +288,20 @@ class HashGridTrainer:
         grad, effects = self.effects.backward_residual(seen, half_gradient * (2 / (3 * rays)))
         value, grad_weights = huber.sum() / (3 * rays), torch.zeros_like(forward_pass.weights)
         backend, stepping = self.model.backend, self.model.stepping
+        mapped, samples = forward_pass.mapped, forward_pass.samples
         if self.settings.distortion_weight:
             per_ray = self.settings.distortion_weight * distortion_multiplier(progress) / rays
             each = torch.full_like(batch.sparse_depth, per_ray)
-            value = value + (each * backend.distortion(forward_pass.samples, forward_pass.weights, stepping)).sum()
-            grad_weights = backend.distortion_backward(forward_pass.samples, forward_pass.weights, stepping, each)
+            marched = samples._replace(dt=samples.dt / mapped.scene_length(samples.t, samples.ray))
+            value = value + (each * backend.distortion(marched, forward_pass.weights, stepping)).sum()
+            grad_weights = backend.distortion_backward(marched, forward_pass.weights, stepping, each)
         if self._has_depth_loss(progress):
             per_ray = self.settings.depth_weight * depth_loss_multiplier(progress) / rays
             each = torch.full_like(batch.sparse_depth, per_ray)
-            arguments = forward_pass.rays.far, batch.sparse_depth, stepping
-            depth_loss = backend.depth_loss(
-                forward_pass.samples, forward_pass.weights, forward_pass.rendering.opacity, *arguments
-            )
+            arguments = mapped.rays.far, mapped.from_scene(batch.sparse_depth), stepping
+            depth_loss = backend.depth_loss(samples, forward_pass.weights, forward_pass.rendering.opacity, *arguments)
             value = value + (each * depth_loss).sum()
-            more_weights, more_opacity = backend.depth_loss_backward(forward_pass.samples, *arguments, each)
+            more_weights, more_opacity = backend.depth_loss_backward(samples, *arguments, each)
             grad_weights, grad = grad_weights + more_weights, grad._replace(opacity=grad.opacity + more_opacity)
         return Loss(value, error.square().sum() / (3 * rays), grad, grad_weights, effects)
 
