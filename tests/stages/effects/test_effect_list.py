@@ -12,7 +12,7 @@ from nerf.effects.exposure import ExposureModel
 from nerf.fields.hash_grid import HashGridField
 from nerf.kernels import torch as reference
 from nerf.training.hash_grid_trainer import HashGridTrainer
-from pipeline.cli.settings import Settings, with_effects
+from pipeline.cli.options import Settings, with_effects
 from stages import effects
 from stages.effects.decisions import image_effects, read_decisions
 from stages.effects.effect_list import EFFECTS, Effect, EffectParts
