@@ -287,7 +287,7 @@ def test_photos_asked_for_are_scored_whatever_they_take(make: Make, tmp_path: Pa
 
 def test_a_photo_too_large_for_the_time_is_scored_smaller(make: Make, progress: Any, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(evaluate, "MIN_SIDE", 4)
-    monkeypatch.setattr("stages.render.renderer.Allowance.left", lambda _: 2.0)
+    monkeypatch.setattr("stages.render.renderer.TimeBudget.seconds_left", lambda _: 2.0)
     inputs = make(speed=WIDTH * HEIGHT // 32)  # a photo takes 32 seconds
 
     def downscale(**asked: Any) -> float | None:
