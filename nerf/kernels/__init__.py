@@ -35,11 +35,11 @@ CONTRACTED_BOX = 2.0  # half the side of the contracted space
 class GridLayout(NamedTuple):
     """A table that holds the vertices of several grids over the unit cube: level after level, a row per vertex.
 
-    Level l has ``resolutions[l]`` cells along each axis and owns the rows [first_rows[l], first_rows[l + 1]), the last
-    few of which may belong to no vertex. Where these suffice for all (R + 1)³ vertices, vertex (x, y, z) has row
-    first_rows[l] + (x (R + 1) + y) (R + 1) + z (a dense level). Otherwise their number is a power of two, and vertices
-    share rows by the hash (x ⊕ 2654435761 y ⊕ 805459861 z) mod rows, in unsigned 32-bit arithmetic (Müller et al.
-    2022, eq. 4).
+    Level l has ``resolutions[l]`` cells along each axis and owns the rows [level_offsets[l], level_offsets[l + 1]), the
+    last few of which may belong to no vertex. Where these suffice for all (R + 1)³ vertices, vertex (x, y, z) has row
+    level_offsets[l] + (x (R + 1) + y) (R + 1) + z (a dense level). Otherwise their number is a power of two, and
+    vertices share rows by the hash (x ⊕ 2654435761 y ⊕ 805459861 z) mod rows, in unsigned 32-bit arithmetic (Müller et
+    al. 2022, eq. 4).
     """
 
     resolutions: tuple[int, ...]

@@ -31,8 +31,8 @@ def curve_svg(
     points: Sequence[dict[str, Any]], baselines: dict[str, float | None], coming: PredictedGain | None = None
 ) -> str | None:
     """PSNR against training seconds, one grid line per doubling of the time, with the start of diminishing returns and
-    the ``coming`` gain the next doubling is predicted to buy; None for fewer than two points. ``baselines`` are drawn
-    as horizontal lines under their names.
+    the ``coming`` gain that the next doubling is predicted to bring; None for fewer than two points. ``baselines`` are
+    drawn as horizontal lines under their names.
     """
     rows = [row for row in points if row["seconds"] > 0]
     if len(rows) < 2:
