@@ -60,7 +60,7 @@ TRAINING: dict[str, str] = {
     r"\bparts\.json\b|\b(floor_share|most_rays_per_second|steps_timed)\b": "profile.json, efficiency, profiled steps",
     r"validation_probe|\b(make_probe|make_patches|ProbeResult|PROBE_RAYS|unseen_photos)\b": "evaluation pixels",
     r"\bsymptom|\bis_suspicious\b|\bunripe\b|\b(field is|stays) dead\b": "failure reason, undertrained, collapsed",
-    r"\b(CLOSING_SHARE|schedule_of\(steps|is_whole\b.*revision)|\bplan\.json\b": "step schedule, decay phase, schedule.json",
+    r"\b(CLOSING_SHARE|schedule_of\(steps|is_whole\b.*revision)|\bplan\.json\b": "step schedule, schedule.json",
     r"\brate_(start|end)\b|\bleast_photos\b": "learning rate, min_photos",
     r"\b(REGION_HALF|ALIGNED_ROWS|first_rows|of_directions)\b": "REGION_HALF_SIZE, ROW_ALIGNMENT, level_offsets",
     r"\b(KNEE|KNEE_DB)\b|predicted to buy|\bthe knee\b": "diminishing returns, gain",

@@ -88,19 +88,17 @@ def _choice_message(
     """What was chosen, how long it takes, and whether that is more time or a smaller video than usual."""
     camera = path.cameras[0]
     seconds = frames * camera.width * camera.height / rays_per_second
-    description = (
-        f"{short_count(rays_per_second)} rays/s here: {frames} frames {camera.width}×{camera.height} take about "
+    size = f"{frames} frames {camera.width}×{camera.height}"
+    message = (
+        f"{short_count(rays_per_second)} rays/s here: {size} take about {duration(seconds)}, {time_budget.message()}"
     )
-    description += f"{duration(seconds)}, {time_budget.message()}"
     if seconds > (time_budget.given or time_budget.trained):
         return f"{message}; that is longer, {'as requested' if any(given) else 'but there is no smaller video'}"
     small = (given[0] is None and frames < MIN_FRAMES) or (
         given[1] is None and max(camera.width, camera.height) < SMALL_SIDE - 2
     )
     return (
-        f"{description}; more would take too long: use --render.frames and --render.width to get it"
-        if small
-        else description
+        f"{message}; more would take too long: use --render.frames and --render.width to get it" if small else message
     )
 
 

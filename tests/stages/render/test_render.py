@@ -381,7 +381,7 @@ def test_a_field_without_exposure_says_nothing_of_it(inputs, progress) -> None:
     ("like", "level", "words", "note"),
     [
         ("0.jpg", 0.6858, "exposed as estimated for 0.jpg", "0.jpg is no training photo: its exposure is estimated"),
-        ("81.jpg", 0.5, NEUTRAL, f"there is no registered photo 81.jpg: {NEUTRAL}; did you mean 8.jpg?"),
+        ("81.jpg", 0.5, NEUTRAL, f"there is no registered photo 81.jpg: {NEUTRAL}; did you mean 8.jpg"),
     ],
 )
 def test_missing_exposure_is_no_error_after_training(
