@@ -1,8 +1,8 @@
 """Stage evaluate: how good the field is on photos it has never seen, and beside two trivial predictions.
 
-Every test photo is scored at its own size, up to 1600 pixels of the longer side, whatever the field was trained at; where
-there is no time for all of it, in tiles. PSNR is taken from the float image in [0, 1], per photo; figures over all photos
-are means of the photos' own.
+Every test photo is scored at its own size, up to 1600 pixels of the longer side, whatever size was trained on; where
+there is no time for all of it, in tiles. PSNR is taken from the float image in [0, 1], per photo; figures over all
+photos are means of the photos' own.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""From a trained field to figures: test photos are rendered, whole or in tiles, and compared with what the camera saw."""
+"""From a trained field to figures: test photos are rendered, whole or in tiles, and compared with the photos."""
 
 import math
 from collections.abc import Callable
@@ -22,8 +22,8 @@ from stages.evaluate.baselines import MeanPhoto, mean_photo, nearest_view, resiz
 from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
 from stages.evaluate.image_metrics import error_map, ssim
 from stages.evaluate.seconds import PREVIEW_SHARE
+from stages.evaluate.summary import line_of, overall, photos_in_words, verdict
 from stages.evaluate.tiles import Tiles, tiles_of
-from stages.evaluate.verdict import line_of, overall, photos_in_words, verdict
 from stages.io.files import read_json, read_scene, write_json, write_png
 from stages.render.renderer import Renderer, load_renderer
 from stages.train.config import BLACK, WHITE

@@ -57,8 +57,8 @@ def affordable_fraction(config: "Config", inputs: Inputs, progress: Progress) ->
 
 
 def _rounded_down(affordable: float, with_preview: float) -> float:
-    """The fraction to score where ``affordable`` of the whole could be rendered; one in tiles costs ``with_preview`` times
-    as much. 1 where all is affordable."""
+    """The fraction to score where ``affordable`` of the whole could be rendered: 1 where that is all; in tiles, which
+    cost ``with_preview`` times as much, two digits of it."""
     if affordable >= 1:
         return 1.0
     fraction = affordable / with_preview

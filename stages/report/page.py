@@ -31,7 +31,7 @@ from stages.report.cameras import (
     uncertainty,
 )
 from stages.report.effects import effects_table
-from stages.report.plots import ORDER_COLOURS, camera_svgs, curve_svg
+from stages.report.plots import ORDER_COLOURS, Score, camera_svgs, curve_svg
 from stages.report.profile import parts_bar
 from stages.tradeoff.plots import COLUMNS, plot_svg, rendering_sentence, table_cells
 from stages.train.curve import coming_doubling, doubling_words, knee_words, more_option, ssim_words
@@ -267,7 +267,9 @@ def _curve(results: Results) -> dict[str, Any] | None:
     points, metrics = results.curve["points"], results.metrics or {}
     baselines = {"nearest training view": "psnr_nearest_view", "mean image": "psnr_mean_image"}
     coming = coming_doubling(results.curve["field"], results.curve["whole"], points)
-    svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming)
+    scored = metrics.get("psnr") is not None
+    score = Score(metrics["psnr"], metrics["psnr_interval"]) if scored else None
+    svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming, score)
     if svg is None:
         return None
     words = [doubling_words(points, coming), knee_words(points), ssim_words(points)]

@@ -64,7 +64,9 @@ def patch_directions(camera: "Camera", downscale: float | None) -> "Tensor":
     return torch.from_numpy(camera_rays(camera, math.ceil(width / shrink), math.ceil(height / shrink)))
 
 
-def training_dataset(ingest: Path, scene: "Scene", split: "Split", downscale: float | None, progress: Progress) -> RayDataset:
+def training_dataset(
+    ingest: Path, scene: "Scene", split: "Split", downscale: float | None, progress: Progress
+) -> RayDataset:
     """All pixels and rays of one split, on the CPU; the pixels are mapped from the pixel store, which is made if need
     be. What masks ignore is never drawn. Raises StageError, ALL_MASKED, where they leave nothing."""
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)

@@ -15,13 +15,23 @@ from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from stages import evaluate
 from stages.effects.decisions import Decisions, image_effects, learnt_of_photos
-from stages.evaluate import Examiner
+from stages.evaluate import scoring
 from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
+from stages.evaluate.summary import line_of
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.render.renderer import Renderer
 from stages.train.data import PhotoReader, training_dataset, view_rays
 from tests.stages.photo_scene import photographed
 from tests.synthetic_photos import Quiet
+
+METRICS: dict[str, Any] = {"psnr": 20.5, "psnr_interval": None, "ssim": 0.6, "psnr_nearest_view": 15.0} | {
+    "psnr_mean_image": 12.0,
+    "photos_scored": 2,
+    "photos_test": 2,
+    "fraction": 1,
+    "scored_size": (64, 48),
+    "trained_size": (64, 48),
+}
 
 
 def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_exposed(
@@ -39,10 +49,12 @@ def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_expo
         given.append((model, rendering.colour))
         return rays._replace(near=rays.near + 0.5)  # seen from elsewhere
 
-    monkeypatch.setattr("stages.evaluate.half_images.from_fitted_pose", fit)
+    monkeypatch.setattr(scoring, "from_fitted_pose", fit)
     neutral = Renderer(AppearanceModel(field, (ExposureModel(torch.full((1, 3), 0.3)),)), torch.zeros(3))
-    examiner = Examiner(scene, inputs["ingest"], tmp_path, neutral, {view.name: gain}, True, 1.0)
-    (scored,) = examiner.score([view], Quiet())
+    reader = PhotoReader(inputs["ingest"], scene, 1.0)
+    gains = {each.name: gain for each in scene.of_split("test")}
+    scorer = scoring.Scorer(scene, inputs["ingest"], neutral, gains, True, None, 1.0, reader, reader)
+    scored = scoring.score(scorer, tmp_path, Quiet()).images[0]
     rays = view_rays(scene, view, 1.0)
     assert given[0][0] is field and torch.equal(given[0][1], plain.draw(rays).colour)
     truth = PhotoReader(inputs["ingest"], scene, 1.0).pixels(view, (0.0,) * 3)
@@ -86,18 +98,18 @@ def test_a_test_photos_pose_is_fitted_in_units_of_what_it_sees(monkeypatch: pyte
 )
 def test_poses_are_fitted_where_training_refined_them_or_as_asked(asked: Any, refined: bool, fitted: bool) -> None:
     field = {"kind": "grid"} | ({"poses": {"a.jpg": [0.0] * 6}} if refined else {})
-    assert evaluate.fits_poses(evaluate.Config(fit_poses=asked), field) is fitted
+    assert scoring.fits_poses(evaluate.Config(fit_poses=asked), field) is fitted
 
 
 @pytest.mark.parametrize(
     ("scores", "words"),
     [
         ((20.0, 20.3, None), ""),
-        ((20.0, 20.6, None), " · right halves 20.0 dB, 20.6 dB with its exposure fitted on the left half"),
+        ((20.0, 20.6, None), " · right halves 20.0 dB, 20.6 dB with the exposure fitted on the left half"),
         ((20.0, 20.3, 20.4), ""),
         (
             (20.0, 20.3, 24.0),
-            " · right halves 20.0 dB, 20.3 dB with its exposure fitted on the left half, 24.0 dB with its pose, too",
+            " · right halves 20.0 dB, 20.3 dB with the exposure fitted on the left half, 24.0 dB with the pose, too",
         ),
         ((None, None, None), ""),
     ],
@@ -105,4 +117,5 @@ def test_poses_are_fitted_where_training_refined_them_or_as_asked(asked: Any, re
 def test_the_line_names_what_was_fitted_where_that_makes_a_difference(
     scores: tuple[float | None, ...], words: str
 ) -> None:
-    assert evaluate._right_halves(dict(zip(evaluate.RIGHT_HALVES, scores, strict=True))) == words
+    fitted = dict(zip(evaluate.RIGHT_HALVES, scores, strict=True))
+    assert f"20.5 dB, SSIM 0.60{words} · nearest photo" in line_of(METRICS | fitted)
