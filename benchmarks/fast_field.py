@@ -20,8 +20,6 @@ from benchmarks.nerfacto import HERE, pipeline, stage_folder
 from benchmarks.record import Record, add_out
 from stages.io.files import read_json, read_scene
 
-EVERY_PHOTO = 10**6
-
 
 class Case(NamedTuple):
     """A set, photo width / trained width, seconds of training, and the width of the timed frame."""
@@ -60,7 +58,7 @@ def train(workspace: Path, case: Case) -> float:
     _, status, usage = os.wait4(process.pid, 0)
     if status:
         raise SystemExit(f"{' '.join(command)} ended with status {status}")
-    pipeline("evaluate", workspace, "--evaluate.photos", str(EVERY_PHOTO))
+    pipeline("evaluate", workspace, "--evaluate.fraction", "1")
     return usage.ru_maxrss / 1e6
 
 

@@ -17,6 +17,7 @@ from tyro.conf import Suppress
 from nerf.geometry.scene import Scene
 from stages.amounts import duration, short_count
 from stages.contract import Inputs
+from stages.evaluate.summary import scored_on
 from stages.io.ascii_names import shell_quoted
 from stages.io.files import read_json, read_scene, read_tensors
 from stages.io.pixels import load_pixels, pillow
@@ -106,6 +107,7 @@ def summarise(results: Results) -> dict[str, Any]:
         "expected_seconds": _expected(manifests),
         "training_parts": results.parts,
         **{key: metrics.get(key) for key in ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")},
+        "scored_fraction": metrics.get("fraction"),
         "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
         "verdict": metrics.get("verdict", "Not measured: stage evaluate has not run."),
     }
@@ -147,6 +149,7 @@ def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
         curve=_curve(results),
         parts=parts_bar(results.parts),
         metrics=results.metrics,
+        scored_on=scored_on(results.metrics) if results.metrics and results.metrics["images"] else None,
         compared=_compared(results),
         video=_video(results.inputs, config.video_limit_mb),
         **_mesh_part(results),

@@ -149,7 +149,10 @@ def _write_metrics(folder: Path, scene: Scene, size: tuple[int, int]) -> None:
         "background": [1.0, 1.0, 1.0],
         "photos_scored": len(images),
         "photos_test": len(images),
-        "width_share": 1.0,
+        "fraction": 0.25,
+        "photo_size": [*size],
+        "scored_size": [*size],
+        "trained_size": [size[0] // 2, size[1] // 2],
         "error_scale": [0, 0.3],
     }
     words = {"notes": ["LPIPS is not computed"], "verdict": "Better than any photo nearby by 7.3 dB but soft."}

@@ -68,6 +68,7 @@ def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path
         "ssim": 0.62,
         "psnr_mean_image": 12.9,
         "psnr_nearest_view": 14.2,
+        "scored_fraction": 0.25,
         "mesh": {"vertices": 105_900, "faces": 211_817, "watertight": False},
         "verdict": "Better than any photo nearby by 7.3 dB but soft.",
         "budget": None,
