@@ -24,6 +24,7 @@ from stages.io.field_files import load_field
 from stages.io.files import read_scene
 from stages.train import loop
 from stages.train.data import training_dataset
+from stages.train.fields import make_trainer, with_defaults
 from stages.train.health_check import symptom_of
 from tests.refusals import refused
 from tests.stages.photo_scene import photographed
@@ -235,8 +236,6 @@ def test_no_number_is_a_symptom(inputs: dict[str, Path], progress: Any) -> None:
 
 
 def train_loop_trainer(inputs: dict[str, Path], dataset: RayDataset) -> HashGridTrainer:
-    from stages.train.fields import make_trainer, with_defaults
-
     settings: dict[str, Any] = {"downscale": 1.0, "steps": 1, "chunks": 1} | GRID | KINDS["torch"]
     asked = train.Config(**settings)
     config = with_defaults(asked.model_copy(update={"contracted": False, "view_dependence": True}))

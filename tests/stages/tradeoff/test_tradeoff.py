@@ -21,6 +21,8 @@ from stages.io.files import read_json, read_scene, write_json
 from stages.tradeoff import Config, benchmark, schedule, study
 from stages.tradeoff.benchmark import score_workspace_field
 from stages.tradeoff.schedule import FEWER_RAYS, PUBLISHED, VARIANTS, WORKSPACE_FIELD, Run, Speed
+from stages.train.config import WHITE
+from stages.train.data import PhotoReader, view_rays
 from tests.refusals import refused
 from tests.stages.photo_scene import photographed
 
@@ -343,9 +345,6 @@ def test_too_little_time_is_said_with_numbers(tmp_path: Path, photos: dict[str, 
 
 
 def test_windows_are_parts_of_the_photos(photos: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    from stages.train.config import WHITE
-    from stages.train.data import PhotoReader, view_rays
-
     monkeypatch.setattr(benchmark, "CROP_SIZE", 8)
     scene = read_scene(photos["normalise"])
     crops = benchmark.make_benchmark(photos["ingest"], scene, 1.0, 5, 2.0)
