@@ -7,46 +7,50 @@ Each workspace has been evaluated with ``--evaluate.fraction 1``: its renders ar
 
 import argparse
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from kornia.metrics import ssim
+from PIL import Image
 
 from benchmarks.record import Record, add_out
 from nerf.training.metrics import psnr
 from stages.evaluate import tiles
-from stages.evaluate.image_metrics import ssim
+from stages.evaluate.image_metrics import SSIM_WINDOW
 from stages.io.files import read_json
 from stages.io.pixels import load_pixels
 
 SIZES, FRACTIONS, CHOICES = (16, 24, 32, 64), (0.02, 0.05, 0.1, 0.25), 40
 
 
-def pictures(workspace: Path) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """Render and photo of every test photo, (H, W, 3) in [0, 1]."""
-    output = workspace / "output"
+class Maps(NamedTuple):
+    """Of a test photo: squared error and structural similarity, (height, width), that of a window at its upper left
+    pixel."""
+
+    error: torch.Tensor
+    similarity: torch.Tensor
+
+
+def maps(workspace: Path) -> list[Maps]:
+    """Of every test photo."""
+    output, found = workspace / "output", []
     files = {photo["name"]: photo["file"] for photo in read_json(output / "photos.json")["photos"]}
-    found = []
     for image in read_json(output / "metrics.json")["images"]:
-        render = load_pixels(output / image["render"], *_size(output / image["render"]))
+        with Image.open(output / image["render"]) as picture:
+            render = np.asarray(picture.convert("RGB"))
         photo = load_pixels(output / files[image["name"]], render.shape[1], render.shape[0])[..., :3]
-        found.append((torch.from_numpy(render.copy()) / 255, torch.from_numpy(photo.copy()) / 255))
+        one, other = (torch.from_numpy(pixels / np.float32(255)).permute(2, 0, 1)[None] for pixels in (render, photo))
+        similarity = ssim(one, other, SSIM_WINDOW, eps=0.0, padding="valid")[0].mean(0)
+        found.append(Maps((one - other)[0].square().mean(0), similarity))
     return found
 
 
-def _size(file: Path) -> tuple[int, int]:
-    from PIL import Image
-
-    with Image.open(file) as image:
-        return image.size
-
-
-def scores(render: torch.Tensor, photo: torch.Tensor, chosen: tiles.Tiles) -> tuple[float, float]:
+def scores(of: Maps, chosen: tiles.Tiles) -> tuple[float, float]:
     """PSNR and SSIM of some tiles."""
-    one, other = chosen.cut(render), chosen.cut(photo)
-    similarity = ssim(one, other)
-    assert similarity is not None
-    mask = chosen.mask(*render.shape[:2])
-    return psnr(float((render[mask] - photo[mask]).square().mean())), similarity
+    inside = tuple(length - SSIM_WINDOW + 1 for length in chosen.size)
+    error = chosen.cut(of.error).mean()
+    return psnr(float(error)), float(chosen._replace(size=inside).cut(of.similarity).mean())
 
 
 def main() -> None:
@@ -57,16 +61,16 @@ def main() -> None:
     given = parser.parse_args()
     record = Record(given.out)
     for workspace in given.workspaces:
-        pairs = pictures(workspace)
-        whole = [(psnr(float((a - b).square().mean())), ssim(a, b)) for a, b in pairs]
+        photos = maps(workspace)
+        whole = [(psnr(float(each.error.mean())), float(each.similarity.mean())) for each in photos]
         for size in SIZES:
             tiles.TILE_SIZE, tiles.MIN_TILES = size, 1
             for fraction in FRACTIONS:
                 off = np.array(
                     [
-                        np.subtract(scores(*pair, tiles.tiles_of(*pair[0].shape[:2], fraction, number)), truth)
+                        np.subtract(scores(each, tiles.tiles_of(*each.error.shape, fraction, number)), truth)
                         for number in range(CHOICES)
-                        for pair, truth in zip(pairs, whole, strict=True)
+                        for each, truth in zip(photos, whole, strict=True)
                     ]
                 )
                 psnr_off, ssim_off = np.sqrt((off**2).mean(0))

@@ -22,9 +22,6 @@ PUBLISHED = ("metrics.json", "renders", "errors")
 NOT_HASHED = ("seconds",)  # it decides how much of the photos is scored, and that enters the key
 FLEXIBLE = Flexible(share=0.05, min_seconds=3.0, max_seconds=60.0)
 
-RIGHT_HALVES = ("psnr_right_half", "psnr_exposure_fitted", "psnr_pose_fitted")
-FIGURES = ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view", *RIGHT_HALVES)
-
 
 class Config(StageConfig):
     """Settings of stage evaluate."""
@@ -66,7 +63,7 @@ def expected_seconds(config: Config, workload: Workload) -> float | None:
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Choose how much of each test photo is scored, by the speed of this machine."""
-    from stages.evaluate.seconds import affordable_fraction
+    from stages.evaluate.planning import affordable_fraction
 
     if config.fraction is not None:
         return config

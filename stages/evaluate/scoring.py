@@ -17,13 +17,11 @@ from nerf.geometry.scene import Scene, View
 from nerf.training.metrics import mean_squared_error, psnr
 from stages.contract import Inputs, Progress, StageError, StageResult
 from stages.effects.decisions import expected_gains
-from stages.evaluate import FIGURES
 from stages.evaluate.baselines import MeanPhoto, mean_photo, nearest_view, resized
 from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
 from stages.evaluate.image_metrics import error_map, ssim
-from stages.evaluate.seconds import PREVIEW_SHARE
-from stages.evaluate.summary import line_of, overall, photos_in_words, verdict
-from stages.evaluate.tiles import Tiles, tiles_of
+from stages.evaluate.summary import FIGURES, line_of, overall, photos_in_words, verdict
+from stages.evaluate.tiles import PREVIEW_SHARE, Tiles, tiles_of
 from stages.io.files import read_json, read_scene, write_json, write_png
 from stages.render.renderer import Renderer, load_renderer
 from stages.train.config import BLACK, WHITE

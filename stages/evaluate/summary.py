@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from typing import Any
 
-from stages.evaluate import FIGURES, RIGHT_HALVES
 from stages.evaluate.image_metrics import ERROR_SCALE, MIN_FOR_INTERVAL, mean_interval
 from stages.train.data import MAX_SCORED_SIDE
 
+RIGHT_HALVES = ("psnr_right_half", "psnr_exposure_fitted", "psnr_pose_fitted")
+FIGURES = ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view", *RIGHT_HALVES)
 MIN_TRUSTED_WIDTH = 0.5  # of the scores' usual one: below, an image can be sharp and the field know no fine detail
 MIN_DIFFERENCE_DB = 0.5  # between two scores of right halves, to be mentioned
 # Why nothing is measured, by whether there are test photos at all.

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 # too, although a window takes 11 of them (docs/experiments/score_tiles.md).
 TILE_SIZE = 16
 MIN_TILES = 16  # of a photo: PSNR of fewer is no measure of it
+PREVIEW_SHARE = 0.25  # of the pixels that are scored of a photo in tiles, for a small image of the whole
 R2_STEPS = (0.7548776662466927, 0.5698402909980532)
 GOLDEN_RATIO = 0.618033988749895  # its multiples modulo 1 fill [0, 1) evenly, however many there are
 

@@ -17,8 +17,9 @@ from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages import evaluate
-from stages.evaluate import seconds
+from stages.evaluate import planning, seconds
 from stages.evaluate.image_metrics import ssim
+from stages.evaluate.summary import FIGURES
 from stages.io.files import write_json, write_png
 from tests.refusals import refused
 
@@ -140,7 +141,7 @@ def test_psnr_of_a_constant_error_is_its_closed_form(error: float, make: Make, t
 def test_overall_figures_are_the_means_of_the_photos(make: Make, tmp_path: Path, progress: Any):
     metrics, _ = _run(make(SkyField(0.1)), tmp_path / "out", progress)
     assert [image["name"] for image in metrics["images"]] == ["001.jpg", "004.jpg", "007.jpg", "010.jpg"]
-    for key in set(evaluate.FIGURES) - {"psnr_pose_fitted"}:
+    for key in set(FIGURES) - {"psnr_pose_fitted"}:
         assert metrics[key] == pytest.approx(np.mean([image[key] for image in metrics["images"]]))
     assert metrics["psnr_pose_fitted"] is None and not metrics["poses_fitted"]
     low, high = metrics["psnr_interval"]
@@ -263,7 +264,7 @@ def test_the_fraction_scored_is_what_there_is_time_for(make: Make, tmp_path: Pat
     ("affordable", "fraction"), [(1.2, 1), (0.99, 0.79), (0.125, 0.1), (0.0626, 0.05), (1e-4, 8e-5)]
 )
 def test_a_fraction_is_rounded_down(affordable: float, fraction: float):
-    assert seconds._rounded_down(affordable, 1.25) == pytest.approx(fraction)
+    assert planning._rounded_down(affordable, 1.25) == pytest.approx(fraction)
 
 
 def test_plan_answers_every_open_question_once(make: Make, progress: Any):
@@ -382,7 +383,7 @@ def test_two_photos_give_no_interval_and_no_trust(make: Make, tmp_path: Path, pr
 
 def test_without_test_photos_nothing_is_measured_and_nothing_fails(make: Make, tmp_path: Path, progress: Any):
     metrics, line = _run(make(tests=0), tmp_path / "out", progress)
-    assert all(metrics[key] is None for key in (*evaluate.FIGURES, "psnr_interval", "ssim_interval"))
+    assert all(metrics[key] is None for key in (*FIGURES, "psnr_interval", "ssim_interval"))
     assert metrics["images"] == [] and metrics["verdict"] == "Not measured: no photo was kept for testing."
     assert metrics["notes"][0] == "no photo was kept for testing, so nothing is measured"
     assert line == "nothing measured: no photo was kept for testing"

@@ -17,7 +17,7 @@ from stages import evaluate
 from stages.effects.decisions import Decisions, image_effects, learnt_of_photos
 from stages.evaluate import scoring
 from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
-from stages.evaluate.summary import line_of
+from stages.evaluate.summary import RIGHT_HALVES, line_of
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.render.renderer import Renderer
 from stages.train.data import PhotoReader, training_dataset, view_rays
@@ -117,5 +117,5 @@ def test_poses_are_fitted_where_training_refined_them_or_as_asked(asked: Any, re
 def test_the_line_names_what_was_fitted_where_that_makes_a_difference(
     scores: tuple[float | None, ...], words: str
 ) -> None:
-    fitted = dict(zip(evaluate.RIGHT_HALVES, scores, strict=True))
+    fitted = dict(zip(RIGHT_HALVES, scores, strict=True))
     assert f"20.5 dB, SSIM 0.60{words} · nearest photo" in line_of(METRICS | fitted)

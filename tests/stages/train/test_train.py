@@ -18,6 +18,7 @@ from stages.io.files import read_json
 from stages.io.photos import Photo, write_photos
 from stages.train import Config
 from stages.train.config import GRID_ONLY, PAPER_ONLY
+from stages.train.data import training_dataset
 from stages.train.fields.hash_grid import LEARNING_RATES
 from stages.train.training import prepare
 from stages.train.validation_images import unseen_photos, with_validation
@@ -175,11 +176,19 @@ def test_without_test_photos_nothing_is_held_out(tmp_path: Path, progress) -> No
     assert "no test photos" in result.line
 
 
+def test_probes_are_at_the_size_that_photos_are_scored_at(tmp_path: Path, progress) -> None:
+    inputs, scene = photographed(tmp_path)
+    dataset = training_dataset(inputs["ingest"], scene, "test", 2.0, progress)
+    unseen = unseen_photos(Config(downscale=2.0), inputs["ingest"], scene, "test", "cpu", progress)
+    assert unseen
+    ball_and_white = {(30, 60, 200), (255, 255, 255)}
+    assert {*map(tuple, (unseen.probe.colours * 255).round().int().tolist())} == ball_and_white
+    assert not {*map(tuple, dataset.pixels[:, :3].tolist())} <= ball_and_white, "at the trained size edges are mixed"
+
+
 def test_test_photos_of_which_masks_leave_nothing_stop_no_training(tmp_path: Path, progress) -> None:
     """Validation photos, by which a run is to end, do."""
-    dot = np.zeros((HEIGHT, WIDTH), np.uint8)
-    dot[4, 4] = 255
-    inputs, masked = photographed(tmp_path, mask=dot)
+    inputs, masked = photographed(tmp_path, mask=np.zeros((HEIGHT, WIDTH), np.uint8))
     config = Config(downscale=2.0)
     assert unseen_photos(config, inputs["ingest"], masked, "test", "cpu", progress) is None
     why = "the masks ignore every pixel of the test photos at this size"
