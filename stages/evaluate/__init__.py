@@ -15,7 +15,7 @@ from stages.evaluate.seconds import SHARE, other_seconds
 from stages.train import trained_seconds
 
 INPUTS = ("ingest", "normalise", "train")
-VERSION = 14
+VERSION = 15
 EXIT_CODE = 15
 RESUMES = False
 PUBLISHED = ("metrics.json", "renders", "errors")

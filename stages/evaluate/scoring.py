@@ -2,21 +2,20 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from nerf.effects.appearance import AppearanceModel
 from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from nerf.geometry.scene import Scene, View
 from nerf.training.metrics import mean_squared_error, psnr
 from stages.contract import Inputs, Progress, StageError, StageResult
-from stages.effects.decisions import expected_gains
+from stages.effects.image_effects import held_out_words, photo_effects, refines_poses
 from stages.evaluate.baselines import MeanPhoto, mean_photo, nearest_view, resized
 from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
 from stages.evaluate.image_metrics import error_map, ssim
@@ -52,7 +51,7 @@ def load(config: "Config", inputs: Inputs, progress: Progress) -> "Scorer":
         scene,
         inputs["ingest"],
         load_renderer(inputs["train"], BACKGROUNDS[chosen] if chosen else None, progress),
-        expected_gains(field, scene, scene.of_split("test")),
+        field,
         fits_poses(config, field),
         config.downscale,
         config.fraction,
@@ -70,7 +69,7 @@ def fits_poses(config: "Config", field: dict[str, Any]) -> bool:
         raise StageError(
             "evaluate.no-pose-fit", "cannot fit poses of test photos", why, "Give --evaluate.fit-poses auto."
         )
-    return fittable and (config.fit_poses == "on" or (config.fit_poses == "auto" and "poses" in field))
+    return fittable and (config.fit_poses == "on" or (config.fit_poses == "auto" and refines_poses(field["effects"])))
 
 
 # --- compute
@@ -104,15 +103,15 @@ class Scorer:
     """What renders test photos at 1/``downscale`` of their size, ``fraction`` of each in tiles, and compares them with
     what the camera saw, less what masks ignore.
 
-    ``gains`` are the exposures expected of photos by their names, where exposure is modelled; ``fits_poses``: right
-    halves have a third score, with the photo's pose fitted, too. ``photos`` and ``trained_photos`` read photos at the
+    ``field`` is the content of field.json; ``fits_poses``: right halves have a third score, with the photo's pose
+    fitted, too. ``photos`` and ``trained_photos`` read photos at the
     size they are scored at and at the one that the field was trained on.
     """
 
     scene: Scene
     ingest: Path
     renderer: Renderer
-    gains: dict[str, Tensor]
+    field: dict[str, Any]
     fits_poses: bool
     downscale: float | None
     fraction: float
@@ -167,12 +166,11 @@ class Scorer:
 
     def _at_fitted_pose(self, view: View, truth: Tensor, scored: Tensor | None) -> Rendering:
         """The view from where its left half says that it was taken."""
-        model = self.renderer.model
-        field = model.model if isinstance(model, AppearanceModel) else model
+        field, rays, background = self.renderer.field, self._rays(view), self.renderer.background.cpu()
         assert isinstance(field, HashGridField), "only with a hash-grid field does evaluate fit poses"
-        rays = self._rays(view)
-        as_it_is = self._render(replace(self.renderer, model=field), rays, scored)
-        moved = from_fitted_pose(field.on_cpu(), rays, as_it_is, self.renderer.background.cpu(), truth, scored)
+        rendering = self._render(self._renderer(view), rays, scored)
+        effects = photo_effects(self.field, self.scene, view)
+        moved = from_fitted_pose(field.on_cpu(), rays, rendering, background, truth, scored, effects)
         return self._render(self._renderer(view), moved, scored)
 
     @staticmethod
@@ -214,7 +212,7 @@ class Scorer:
         return view_rays(self.scene, view, self.downscale)
 
     def _renderer(self, view: View) -> Renderer:
-        return self.renderer.at_gain(self.gains[view.name]) if self.gains else self.renderer
+        return self.renderer.through(photo_effects(self.field, self.scene, view, self.renderer.device))
 
 
 def _psnr(image: Tensor, truth: Tensor, used: Tensor | None) -> float:
@@ -242,7 +240,7 @@ def save(scorer: Scorer, scores: Scores, folder: Path) -> StageResult:
             for name, downscale in downscales.items()
         },
         "background": scorer.renderer.background.tolist(),
-        "exposure": "as the photos taken nearest by" if scorer.gains else None,
+        "appearance": held_out_words(scorer.field),
         "poses_fitted": scorer.fits_poses,
     }
     metrics["verdict"] = verdict(metrics)

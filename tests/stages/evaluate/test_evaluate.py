@@ -105,7 +105,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
         identity = Similarity(1.0, np.eye(3), np.zeros(3))
         scene = Scene((camera,), tuple(views), identity, False, alpha, "inside", True)
         write_json(inputs["normalise"] / "scene.json", scene.to_json())
-        info = {"kind": "sky", "downscale": downscale, "background": [0.0, 0.0, 0.0]}
+        info = {"kind": "sky", "downscale": downscale, "background": [0.0, 0.0, 0.0], "effects": {}}
         write_json(inputs["train"] / "field.json", info)
         write_json(inputs["train"] / "curve.json", {"points": [{"seconds": 2.0}]})
         monkeypatch.setattr("stages.render.renderer.Renderer.rays_per_second", lambda *_: speed)
@@ -303,7 +303,7 @@ def exposed(inputs: dict[str, Path], log_gain: float, noise: float) -> dict[str,
 
 
 @pytest.mark.parametrize("stops", [-1.0, 0.5])
-def test_the_exposure_of_a_test_photo_is_no_fault_of_the_field(stops: float, make: Make, tmp_path: Path, progress: Any):
+def test_a_test_photos_exposure_is_no_fault(stops: float, make: Make, tmp_path: Path, progress: Any):
     log_gain = stops * math.log(2)
     metrics, line = _run(exposed(make(), log_gain, 0.03), tmp_path / "out", progress)
     noise_alone = -20 * math.log10(0.03)
@@ -353,7 +353,7 @@ def test_what_masks_ignore_does_not_count(make: Make, tmp_path: Path, progress: 
     assert metrics["psnr_mean_image"] < 25 and metrics["ssim"] > 0.5
 
 
-def test_a_photo_of_which_masks_leave_nothing_at_this_size_is_not_scored(make: Make, tmp_path: Path, progress: Any):
+def test_a_fully_masked_photo_is_not_scored(make: Make, tmp_path: Path, progress: Any):
     inputs = masked(make(downscale=2), np.zeros((HEIGHT, WIDTH), bool))
     dot = np.zeros((HEIGHT, WIDTH), np.uint8)
     dot[3, 3] = 255
@@ -405,7 +405,7 @@ def test_lpips_is_named_as_missing(make: Make, tmp_path: Path, progress: Any):
     assert metrics["notes"][-1].startswith("LPIPS is not computed: ")
 
 
-def test_poses_cannot_be_fitted_to_a_field_without_gradients_of_rays(make: Make, tmp_path: Path, progress: Any) -> None:
+def test_poses_need_gradients_of_rays(make: Make, tmp_path: Path, progress: Any) -> None:
     inputs = make()
     with refused("evaluate.no-pose-fit", "sky"):
         _run(inputs, tmp_path / "on", progress, fit_poses="on")

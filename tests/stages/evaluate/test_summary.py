@@ -65,7 +65,7 @@ def test_photos_too_small_for_ssim_are_judged_by_psnr_alone():
 @pytest.mark.parametrize(
     ("fraction", "part"), [(0.25, "25% of each of "), (0.29, "29% of each of "), (0.0052, "0.52% of each of "), (1, "")]
 )
-def test_a_score_of_a_part_of_the_photos_says_so_first(fraction: float, part: str):
+def test_a_score_of_a_part_says_so(fraction: float, part: str):
     metrics = METRICS | {"fraction": fraction}
     assert f"28.9 dB on {part}7 unseen photos at 800 × 600" in verdict(metrics)
     assert line_of(metrics).endswith(f" · {part}7 photos at 800 × 600")

@@ -14,7 +14,7 @@ FRACTIONS = st.floats(0.001, 1)
 
 @given(SIDES, SIDES, FRACTIONS, st.integers(0, 500))
 @settings(max_examples=60, deadline=None)
-def test_tiles_lie_in_the_photo_and_are_as_many_as_asked(height: int, width: int, fraction: float, number: int):
+def test_as_many_tiles_as_asked_lie_in_the_photo(height: int, width: int, fraction: float, number: int):
     tiles = tiles_of(height, width, fraction, number)
     rows, columns = tiles.size
     assert (tiles.corners >= 0).all() and (tiles.corners + tiles.size <= (height, width)).all()
@@ -67,7 +67,7 @@ def test_tiles_of_nothing_but_ignored_pixels_are_not_taken():
     assert tiles_of(320, 320, 0.01, 7, one).corners.tolist() == [[0, 0]]
 
 
-def test_the_mean_over_tiles_is_that_of_the_photo_within_noise():
+def test_the_mean_over_tiles_is_the_photos_within_noise():
     y, x = np.mgrid[:480, :640]
     error = torch.from_numpy((np.sin(x / 90) * np.sin(y / 70)) ** 2 + 0.2 * (x > 500) + 0.1 * (y < 40))
     estimates = [float(error[tiles_of(480, 640, 0.1, number).mask(480, 640)].mean()) for number in range(200)]

@@ -100,7 +100,7 @@ def run_mesh(tmp_path, progress, monkeypatch):
             path.mkdir(exist_ok=True)
         write_json(inputs["normalise"] / "scene.json", (scene or scene_around()).to_json())
         write_tensors(inputs["normalise"] / "points.safetensors", {"xyz": points})
-        info = {"rays": 1000} | (learnt or {})
+        info = {"rays": 1000, "effects": learnt or {}}
         write_json(inputs["train"] / "field.json", info)
         monkeypatch.setattr(extraction, "load_field", lambda *_: (model, info))
         config = mesh.Config.model_validate({"resolution": 48} | settings)
@@ -139,7 +139,7 @@ class Painted(Solid):
         return torch.where(distance < 0, inside, torch.ones(3))
 
 
-def test_colours_are_those_of_what_is_seen_first_not_of_the_emptiness_that_a_vertex_may_lie_in(run_mesh):
+def test_colours_are_those_of_the_first_surface_seen(run_mesh):
     _, folder = run_mesh(Painted(ball, inside=3000.0), max_faces=1500)
     colours = colours_of(trimesh.load_mesh(folder / "mesh.ply", process=False))
     assert (colours[:, :2] < (256, 64)).mean() > 0.99, "not white: what is outside"
@@ -176,13 +176,13 @@ def test_the_facts_are_those_of_the_files(run_mesh):
     assert 0 < facts["iso_level"] < 300 and 0 < facts["surface_error_voxels"] < 0.5
 
 
-def test_colours_at_a_neutral_exposure_say_at_which(run_mesh):
+def test_colours_at_a_reference_exposure_say_at_which(run_mesh):
     result, _ = run_mesh(Solid(ball))
-    assert "exposure" not in result.facts and "expos" not in result.line
+    assert "appearance" not in result.facts and "expos" not in result.line
     stop = math.log(2)
     photos = {"a.jpg": [0.0, 0.1 * stop, 0.2 * stop], "b.jpg": [stop] * 3, "c.jpg": [2 * stop] * 3}
-    result, _ = run_mesh(Solid(ball), "exposed", learnt={"exposure": {"neutral": [stop] * 3, "photos": photos}})
-    assert result.facts["exposure"] == "reference exposure, +0.90 EV over the least exposed photo"
+    result, _ = run_mesh(Solid(ball), "exposed", learnt={"exposure": photos})
+    assert result.facts["appearance"] == "reference exposure, +0.90 EV over the least exposed photo"
     assert result.line.endswith("watertight · reference exposure, +0.90 EV over the least exposed photo")
 
 
@@ -233,7 +233,7 @@ def test_a_part_that_no_sparse_point_locates_is_dropped(run_mesh):
     assert unknown.facts["components_kept"] == 2
 
 
-def test_a_plain_ends_at_the_box_or_where_the_photos_end(run_mesh):
+def test_a_plain_ends_at_box_or_photos(run_mesh):
     result, folder = run_mesh(Solid(plain))
     assert result.facts["watertight"] is False
     assert "open at the edge of the region" in result.line
@@ -288,7 +288,7 @@ def test_a_grid_beyond_memory_is_refused_with_one_that_fits(run_mesh, monkeypatc
     assert error.value.hint == "Try --mesh.resolution 32."
 
 
-def test_the_resolution_that_fits_into_seconds_is_that_of_the_box(run_mesh, monkeypatch):
+def test_resolution_for_seconds_follows_the_box(run_mesh, monkeypatch):
     asked = []
     monkeypatch.setattr(resolution, "reference_seconds", lambda: 0.02)
     monkeypatch.setattr(resolution, "density_query_seconds", lambda train, box: asked.append(box) or 2e-7)
