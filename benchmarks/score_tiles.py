@@ -68,9 +68,10 @@ def main() -> None:
             for fraction in FRACTIONS:
                 off = np.array(
                     [
-                        np.subtract(scores(each, tiles.tiles_of(*each.error.shape, fraction, number)), truth)
+                        np.subtract(scores(each, tiles.tiles_of(height, width, fraction, number)), truth)
                         for number in range(CHOICES)
                         for each, truth in zip(photos, whole, strict=True)
+                        for height, width in [each.error.shape]
                     ]
                 )
                 psnr_off, ssim_off = np.sqrt((off**2).mean(0))

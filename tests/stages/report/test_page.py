@@ -48,7 +48,9 @@ def test_scored_and_shown_photos_may_be_some(tmp_path: Path, progress: Any):
         and "<p>25% of each of 6 of 9 photos at 96 × 72 (trained at 48 × 36)</p>" in html
     )
     write_json(path, metrics | {"images": metrics["images"][:1], "photos_scored": 1})
-    assert "<p>1 of 9 test photos</p>" in written(inputs, tmp_path / "one", progress)[0]
+    assert (
+        "<p>25% of 1 of 9 photos at 96 × 72 (trained at 48 × 36)</p>" in written(inputs, tmp_path / "one", progress)[0]
+    )
 
 
 def test_files_beside_the_page_are_named(tmp_path: Path, progress: Any):
