@@ -31,6 +31,11 @@ class EvaluationPixels(NamedTuple):
         mean = self.colours.mean(0).expand_as(self.colours)
         return psnr(mean_squared_error(mean, self.colours))
 
+    def to(self, device: torch.device | str) -> "EvaluationPixels":
+        """The same on another device."""
+        rays, *others = self
+        return EvaluationPixels(rays.each(lambda part: part.to(device)), *(part.to(device) for part in others))
+
 
 class PixelEvaluation(NamedTuple):
     """PSNR in dB and mean opacity of a field on a probe."""
@@ -45,6 +50,10 @@ class EvaluationPatches(NamedTuple):
 
     pixels: EvaluationPixels
     used: Bool[Tensor, "patches side side"]
+
+    def to(self, device: torch.device | str) -> "Patches":
+        """The same on another device."""
+        return Patches(self.probe.to(device), self.used.to(device))
 
 
 def sample_evaluation_pixels(

@@ -83,16 +83,23 @@ def load_renderer(
 
 class TimeBudget:
     """The time to render in a stage that begins now: what is left of the ``seconds`` given to it, less
-    ``other_seconds`` for its other work; by default a fraction of the training time."""
+    ``other_seconds`` for its other work; by default a ``fraction`` of the training time, at least ``min_seconds``."""
 
-    def __init__(self, seconds: float | None, train: Path, other_seconds: float) -> None:
+    def __init__(
+        self,
+        seconds: float | None,
+        train: Path,
+        other_seconds: float,
+        fraction: float = RENDER_FRACTION,
+        min_seconds: float = 0.0,
+    ) -> None:
         self.began, self.given, self.other_seconds = time.perf_counter(), seconds, other_seconds
-        self.trained = trained_seconds(train)
+        self.trained, self.fraction, self.min_seconds = trained_seconds(train), fraction, min_seconds
 
     def seconds_left(self) -> float:
         """The seconds that rendering may still take."""
         if self.given is None:
-            return RENDER_FRACTION * self.trained
+            return max(self.min_seconds, self.fraction * self.trained)
         return max(MIN_RENDER_SECONDS, self.given - (time.perf_counter() - self.began) - self.other_seconds)
 
     def message(self) -> str:

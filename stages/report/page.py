@@ -17,6 +17,7 @@ from tyro.conf import Suppress
 from nerf.geometry.scene import Scene
 from stages.amounts import duration, short_count
 from stages.contract import Inputs
+from stages.evaluate.summary import scored_on
 from stages.io.ascii_names import shell_quoted
 from stages.io.files import read_json, read_scene, read_tensors
 from stages.io.pixels import load_pixels, pillow
@@ -31,8 +32,7 @@ from stages.report.cameras import (
     uncertainty,
 )
 from stages.report.effects import effects_table
-from stages.report.plots import ORDER_COLOURS, camera_svgs, curve_svg
-from stages.report.profile import profile_bar
+from stages.report.plots import ORDER_COLOURS, Score, camera_svgs, curve_svg
 from stages.tradeoff.plots import COLUMNS, plot_svg, rendering_sentence, table_cells
 from stages.train.curve import diminishing_returns_message, doubling_message, more_option, predicted_gain, ssim_message
 
@@ -106,6 +106,7 @@ def summarise(results: Results) -> dict[str, Any]:
         "expected_seconds": _expected(manifests),
         "training_profile": results.profile,
         **{key: metrics.get(key) for key in ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")},
+        "scored_fraction": metrics.get("fraction"),
         "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
         "verdict": metrics.get("verdict", "Not measured: stage evaluate has not run."),
     }
@@ -147,6 +148,7 @@ def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
         curve=_curve(results),
         profile=profile_bar(results.profile),
         metrics=results.metrics,
+        scored_on=scored_on(results.metrics) if results.metrics and results.metrics["images"] else None,
         compared=_compared(results),
         video=_video(results.inputs, config.video_limit_mb),
         **_mesh_part(results),
@@ -265,7 +267,9 @@ def _curve(results: Results) -> dict[str, Any] | None:
     points, metrics = results.curve["points"], results.metrics or {}
     baselines = {"nearest training view": "psnr_nearest_view", "mean image": "psnr_mean_image"}
     coming = predicted_gain(results.curve["field"], results.curve["single_cycle"], points)
-    svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming)
+    scored = metrics.get("psnr") is not None
+    score = Score(metrics["psnr"], metrics["psnr_interval"]) if scored else None
+    svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming, score)
     if svg is None:
         return None
     words = [doubling_message(points, coming), diminishing_returns_message(points), ssim_message(points)]

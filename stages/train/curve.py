@@ -1,9 +1,11 @@
 """curve.json: quality against training time, and what it says in words.
 
 ``{"field": "grid" | "paper", "downscale", "device": "cpu" | "cuda", "threads", "single_cycle", "points": [{"step",
-"seconds", "train_psnr", "heldout_psnr", "heldout_ssim"} …]}``; what cannot be measured is null. ``downscale`` is that
-of the photos, also of those evaluated on. Seconds are those of training steps alone, without evaluations.
-``single_cycle``: the learning rate decayed once, at the end: no finished run was continued, and no target missed.
+"seconds", "train_psnr", "probe_psnr", "probe_ssim"} …]}``; what cannot be measured is null. ``downscale`` is that of
+the photos trained on. ``probe_psnr`` is of a fixed sample of pixels of all test photos, taken together, at the size at
+which photos are scored: it follows the score, PSNR of stage evaluate, and is not it. Seconds are those of training
+steps alone, without evaluations. ``single_cycle``: the learning rate decayed once, at the end: no finished run was
+continued, and no target missed.
 """
 
 from collections.abc import Sequence
@@ -33,9 +35,9 @@ def write_curve(folder: Path, field: str, downscale: float, single_cycle: bool, 
     write_json(folder / "curve.json", about | {"points": points})
 
 
-def heldout_curve(points: Sequence[dict[str, Any]]) -> list[tuple[float, float]]:
-    """(seconds, dB on held-out photos), as nerf/training/learning_curve.py reads it."""
-    known = ((point["seconds"], point["heldout_psnr"]) for point in points)
+def probe_curve(points: Sequence[dict[str, Any]]) -> list[tuple[float, float]]:
+    """(seconds, dB on the test probe), as nerf/training/learning_curve.py reads it."""
+    known = ((point["seconds"], point["probe_psnr"]) for point in points)
     return [(seconds, psnr) for seconds, psnr in known if psnr is not None and seconds > 0]
 
 
@@ -45,7 +47,7 @@ def predicted_gain(field: str, single_cycle: bool, points: Sequence[dict[str, An
     whose learning rate decays all the way, and those not of a ``single_cycle``, which may have decayed at half of
     the time."""
     return (
-        predicted_doubling_gain(heldout_curve(points), points[-1]["step"])
+        predicted_doubling_gain(probe_curve(points), points[-1]["step"])
         if points and field == "grid" and single_cycle
         else None
     )
@@ -53,11 +55,11 @@ def predicted_gain(field: str, single_cycle: bool, points: Sequence[dict[str, An
 
 def doubling_message(points: Sequence[dict[str, Any]], gain: PredictedGain | None) -> str | None:
     """The gain of the last doubling of the time, and the predicted one of the next; None if the curve is too short."""
-    curve = heldout_curve(points)
+    curve = probe_curve(points)
     last = last_doubling_gain(curve)
     if last is None:
         return None
-    message = f"the last doubling of training time, to {duration(curve[-1][0])}, gained {last:+z.1f} dB on test photos"
+    message = f"the last doubling of training time, to {duration(curve[-1][0])}, gained {last:+z.1f} dB on test pixels"
     if gain is None:
         return message
     message += " (less over a run of half the time, which would have ended above this curve)"
@@ -88,7 +90,7 @@ def target_message(target: float | None, reached: float | None, seconds: float) 
 
 def diminishing_returns_message(points: Sequence[dict[str, Any]]) -> str | None:
     """From when on returns diminish, if they do; None if the curve is too short to tell."""
-    curve = heldout_curve(points)
+    curve = probe_curve(points)
     if last_doubling_gain(curve) is None:
         return None
     start = diminishing_returns_seconds(curve)
@@ -99,7 +101,7 @@ def diminishing_returns_message(points: Sequence[dict[str, Any]]) -> str | None:
 
 def ssim_message(points: Sequence[dict[str, Any]]) -> str | None:
     """SSIM at the end and at half of the time; None if it is not known."""
-    known = [(p["seconds"], p["heldout_ssim"]) for p in points if p["heldout_ssim"] is not None and p["seconds"] > 0]
+    known = [(p["seconds"], p["probe_ssim"]) for p in points if p["probe_ssim"] is not None and p["seconds"] > 0]
     if len(known) < 2 or known[0][0] > known[-1][0] / 2:
         return None
     before, after = quality_at(known, known[-1][0] / 2), known[-1][1]
@@ -110,7 +112,7 @@ def ssim_message(points: Sequence[dict[str, Any]]) -> str | None:
 
 def sparkline(points: Sequence[dict[str, Any]]) -> str:
     """Held-out PSNR from the first evaluation to the last, even in log time; "" for fewer than three."""
-    curve = heldout_curve(points)
+    curve = probe_curve(points)
     if len(curve) < 3:
         return ""
     first, ratio = curve[0][0], curve[-1][0] / curve[0][0]

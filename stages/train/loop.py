@@ -250,8 +250,8 @@ class TrainingRun:
         # Right after a kill at the very end there is no batch PSNR yet.
         train = self.speed.psnr if self.speed.count else self._evaluate_training().psnr
         point = {"step": self.state.step, "seconds": round(self.state.seconds, 3), "train_psnr": round(train, 3)}
-        point["heldout_psnr"] = None if test is None else round(test.psnr, 3)
-        point["heldout_ssim"] = None if test is None or test.ssim is None else round(test.ssim, 4)
+        point["probe_psnr"] = None if test is None else round(test.psnr, 3)
+        point["probe_ssim"] = None if test is None or test.ssim is None else round(test.ssim, 4)
         self.state.curve.append(point)
         self.log.point(point)
         if self.evaluation_sets.target is not None:
@@ -410,10 +410,10 @@ class TrainingRun:
 
 def speed_message(state: RunState, speed: TrainingSpeed, left: float) -> str:
     """Step, speed, quality and the seconds left of a run whose speed is known."""
-    known = [point["heldout_psnr"] for point in state.curve if point["heldout_psnr"] is not None]
-    heldout = f" · held out {known[-1]:.1f} dB" if known else ""
+    known = [point["probe_psnr"] for point in state.curve if point["probe_psnr"] is not None]
+    test = f" · {known[-1]:.1f} dB on test pixels" if known else ""
     rays = f"{short_count(speed.rays_per_step / speed.seconds_per_step)} rays/s"
-    return f"step {state.step:,} · {rays} · train {speed.psnr:.1f} dB{heldout} · {left:.0f} s left"
+    return f"step {state.step:,} · {rays} · train {speed.psnr:.1f} dB{test} · {left:.0f} s left"
 
 
 def resumed_message(step: int, total_steps: int, left: float | None) -> str:

@@ -116,7 +116,7 @@ class TrainingLog:
         """Log one point of the curve."""
         self.event("evaluated", **point)
         if self.board is not None:
-            for name in ("train_psnr", "heldout_psnr", "heldout_ssim"):
+            for name in ("train_psnr", "probe_psnr", "probe_ssim"):
                 if point[name] is not None:
                     self.board.add_scalar(name, point[name], point["step"])
             self.board.flush()

@@ -165,7 +165,7 @@ def _facts(training: Training) -> dict[str, object]:
         "rays_per_second": round(state.rays / state.seconds, 1),
         "colours_per_second": round(state.colour_evaluations / state.seconds, 1),
         "train_psnr": last["train_psnr"],
-        "heldout_psnr": last["heldout_psnr"],
+        "probe_psnr": last["probe_psnr"],
         "validation_psnr": state.validation_psnr,
         "curve": state.curve[-5:],
         "downscale": config.downscale,
@@ -177,16 +177,16 @@ def _facts(training: Training) -> dict[str, object]:
 
 
 def _summary(training: Training) -> str:
-    """180 s · 5.4 k steps · 24 k rays/s · held out 28.9 dB, over time ▁▃▅▆▇█ · predicted gain of as long again (--more
-    3m): +0.6 ± 0.4 dB."""
+    """180 s · 5.4 k steps · 24 k rays/s · 28.9 dB on test pixels, over time ▁▃▅▆▇█ · as long again (--more 3m) is
+    predicted to gain +0.6 ± 0.4 dB."""
     config, state = training.config, training.run.state
-    heldout = state.curve[-1]["heldout_psnr"]
+    probe = state.curve[-1]["probe_psnr"]
     before = "" if config.after is None else f", {state.seconds_before:.0f} s of them in the earlier training"
     parts: list[str | None] = [f"{state.seconds:.0f} s{before}"]
     parts += [f"{short_count(state.step)} steps", f"{short_count(state.rays / state.seconds)} rays/s"]
     spark = sparkline(state.curve)
     rising = f", over time {spark}" if spark else ""
-    parts.append("no photos held out" if heldout is None else f"held out {heldout:.1f} dB{rising}")
+    parts.append("no test photos" if probe is None else f"{probe:.1f} dB on test pixels{rising}")
     gain = predicted_gain(config.kind, training.run.schedule.is_single_cycle, state.curve)
     parts.append(predicted_gain_message(state.curve, gain))
     parts.append(target_message(state.pending_target(config.target_psnr), state.validation_psnr, state.seconds))

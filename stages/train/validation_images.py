@@ -59,22 +59,21 @@ class HeldOutQuality(NamedTuple):
 def held_out_evaluation(
     config: Config, ingest: Path, scene: Scene, split: Split, device: str, progress: Progress
 ) -> HeldOutEvaluation | None:
-    """Of the photos of a split, always the same pixels. None if there are none, or if masks leave nothing of the test
-    photos, which decide nothing: then with a note."""
+    """Of the photos of a split, always the same pixels, at the size at which photos are scored. None if there are none,
+    or if masks leave nothing of the test photos, which decide nothing: then with a note."""
     if not scene.of_split(split):
         return None
-    assert config.downscale is not None, "plan() chooses it"
     try:
-        dataset = training_dataset(ingest, scene, split, config.downscale, progress).to(device)
+        dataset = training_dataset(ingest, scene, split, None, progress)
     except StageError as error:
         if split != "test" or error.code != ALL_MASKED:
             raise
-        progress.note(f"held-out quality is not measured while training: {error.why}")
+        progress.note(f"test photos are not measured while training: {error.why}")
         return None
-    background = torch.tensor(field_background(config, scene), device=device)
+    background = torch.tensor(field_background(config, scene))
     return HeldOutEvaluation(
-        sample_evaluation_pixels(dataset, EVALUATION_PIXELS, background, EVALUATION_SEED),
-        sample_evaluation_patches(dataset, EVALUATION_PATCHES, PATCH_SIZE, background, EVALUATION_SEED),
+        sample_evaluation_pixels(dataset, EVALUATION_PIXELS, background, EVALUATION_SEED).to(device),
+        sample_evaluation_patches(dataset, EVALUATION_PATCHES, PATCH_SIZE, background, EVALUATION_SEED).to(device),
         held_out_images(scene.of_split("train"), scene.of_split(split), device),
     )
 
