@@ -38,7 +38,7 @@ class EvaluationPixels(NamedTuple):
 
 
 class PixelEvaluation(NamedTuple):
-    """PSNR in dB and mean opacity of a field on a probe."""
+    """PSNR in dB and mean opacity of a field on evaluation pixels."""
 
     psnr: float
     opacity: float
@@ -51,9 +51,9 @@ class EvaluationPatches(NamedTuple):
     pixels: EvaluationPixels
     used: Bool[Tensor, "patches side side"]
 
-    def to(self, device: torch.device | str) -> "Patches":
+    def to(self, device: torch.device | str) -> "EvaluationPatches":
         """The same on another device."""
-        return Patches(self.probe.to(device), self.used.to(device))
+        return EvaluationPatches(self.pixels.to(device), self.used.to(device))
 
 
 def sample_evaluation_pixels(

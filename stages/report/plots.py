@@ -41,8 +41,8 @@ def curve_svg(
     score: Score | None = None,
 ) -> str | None:
     """PSNR against training seconds, one grid line per doubling of the time, with the start of diminishing returns and
-    the ``coming`` gain that the next doubling is predicted to bring; None for fewer than two points. ``baselines`` are drawn as horizontal lines
-    under their names, the ``score`` of the finished field at the end of the curve.
+    the ``coming`` gain that the next doubling is predicted to bring; None for fewer than two points. ``baselines`` are
+    drawn as horizontal lines under their names, the ``score`` of the finished field at the end of the curve.
     """
     rows = [row for row in points if row["seconds"] > 0]
     if len(rows) < 2:
