@@ -276,7 +276,7 @@ CASES = [
         kernels=True,
     ),
     Case(
-        formula="the sky: sigmoid of what its table has on the unit sphere",
+        formula="background model: sigmoid of its table's features on the unit sphere",
         where="nerf/fields/background.py: background_colour, background_backward",
         domain="finite features",
         hazard="levels cancel: a logit is off by half an ulp of the largest feature; 1 − c is 0 beyond 17",
@@ -314,7 +314,7 @@ CASES = [
         where="nerf/fields/mlp.py: sigma_of, density_backward",
         domain="all finite x",
         hazard="exp overflows beyond 88, and its gradient with it",
-        answer="x is limited to 15, where 0.001 units already stop all light but e⁻³⁰⁰⁰; beyond the gradient is 0",
+        answer="x is limited to 15, where 0.001 units already transmit no more than e⁻³⁰⁰⁰; beyond the gradient is 0",
         tried="|x| < 15; −1e30, −200, −88, ±0, around 15, 88, 1e30",
         typical=lambda: (uniform(1, -15, 15, 512, 1),),
         extreme=lambda: (LOGARITHMS,),
@@ -327,7 +327,7 @@ CASES = [
         kernels=True,
     ),
     Case(
-        formula="density log(1 + exp(x + shift)) of the paper's field",
+        formula="density log(1 + exp(x + shift)) of the vanilla NeRF",
         where="nerf/fields/vanilla.py: shifted_softplus",
         domain="all finite x",
         hazard="exp overflows beyond 88; 1 + exp(x) loses x < −16",
@@ -342,11 +342,11 @@ CASES = [
         differentiable=1,
     ),
     Case(
-        formula="density network: rectified products",
+        formula="density network: matrix products and ReLU",
         where="nerf/fields/mlp.py: density_forward, density_backward",
         domain="features up to 1e30",
         hazard="sums of 64 products cancel; relu has two slopes at 0",
-        answer="float32 products whatever else; errors are shares of the largest output",
+        answer="always float32 products; errors are shares of the largest output",
         tried="features of size 1, 1e-4, 1e-38, 0, 1e30",
         typical=lambda: (uniform(1, -1, 1, 256, FEATURES),),
         extreme=lambda: (uniform(2, -1, 1, 5, FEATURES) * torch.tensor([[1e-4], [1e-38], [0], [1e30], [1e10]]),),
@@ -361,10 +361,10 @@ CASES = [
     Case(
         formula="colour network, sigmoid, c (1 − c)",
         where="nerf/fields/mlp.py: colour_forward, colour_backward",
-        domain="geometry up to 1e30",
+        domain="geometry features up to 1e30",
         hazard="1 − c is 0 in float32 for logits beyond 17: a saturated colour has no gradient",
         answer="accepted: the true one is below 6e-8; finite for every logit",
-        tried="geometry of size 1, 0, 1e-38, 1e3, 1e30; harmonics of size 1",
+        tried="geometry features of size 1, 0, 1e-38, 1e3, 1e30; harmonics of size 1",
         typical=lambda: (uniform(1, -1, 1, 256, GEOMETRY_FEATURES), uniform(2, -1, 1, 256, DIRECTION_FEATURES)),
         extreme=lambda: (
             uniform(3, -1, 1, 4, GEOMETRY_FEATURES) * torch.tensor([[0], [1e-38], [1e3], [1e30]]),
@@ -379,7 +379,7 @@ CASES = [
         kernels=True,
     ),
     Case(
-        formula="Adam without motion where the gradient is 0",
+        formula="Adam that skips entries with zero gradient",
         where="nerf/kernels/torch/adam.py: adam",
         domain="|g| < 1.8e19: beyond, g² overflows, and the norm of all gradients with it: the step is refused",
         hazard="g² underflows below 1e-19; m / √v is 0/0 for an entry never touched",
