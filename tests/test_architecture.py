@@ -24,6 +24,7 @@ MAX_KERNEL_ARGUMENTS = 16
 MAX_ENTRIES = 15
 ALLOWED_BASES = {"Module", "Function", "Exception", "BaseException", "Enum", "IntEnum", "NamedTuple", "Protocol"} | {
     "BaseModel",
+    "Options",
     "StageConfig",
 }
 HEAVY = ("torch", "pycolmap", "kornia", "cv2", "trimesh", "skimage", "scipy", "matplotlib", "PIL", "warp")

@@ -30,7 +30,7 @@ def save_field(folder: Path, model: RadianceModel, info: dict[str, Any]) -> None
     """
     if not isinstance(model, VanillaNerf | HashGridField):
         raise TypeError(f"no file format for a {type(model).__name__}")
-    kind = {"kind": "paper"}
+    kind = {"kind": "vanilla"}
     if isinstance(model, HashGridField):
         kind = {"kind": "grid", "backend": backend_name(model.backend)}
     weights = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
@@ -95,7 +95,7 @@ def _untrained(
     """The field that ``info`` describes; ``stored`` is the size of its weights in bytes, which it must not exceed.
     Raises ValueError, before anything is allocated."""
     kind, settings = info["kind"], info["settings"]
-    if kind not in ("grid", "paper"):
+    if kind not in ("grid", "vanilla"):
         raise ValueError(f"a field of kind {kind!r} is unknown to this version")
     text = json.dumps(settings)
     if kind == "grid":
@@ -103,10 +103,10 @@ def _untrained(
         TypeAdapter(HashGridSettings).validate_json(text, strict=True)
         _check_size(grid.layout.rows * grid.features_per_level, stored)
         return HashGridField(grid, 0, load_backend(backend_of_field(_trained_with(info), device, progress), device))
-    paper = VanillaSettings(**settings)
+    vanilla = VanillaSettings(**settings)
     TypeAdapter(VanillaSettings).validate_json(text, strict=True)
-    _check_size(paper.depth * paper.width**2, stored)
-    return VanillaNerf(paper, seed=0)
+    _check_size(vanilla.depth * vanilla.width**2, stored)
+    return VanillaNerf(vanilla, seed=0)
 
 
 def _trained_with(info: dict[str, Any]) -> BackendName:
