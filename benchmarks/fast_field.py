@@ -16,9 +16,13 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from benchmarks.nerfacto import HERE, pipeline, stage_folder
 from benchmarks.record import Record, add_out
 from stages.io.files import read_json, read_scene
+from stages.render.path import CameraPath, path_rays
+from stages.render.renderer import load_renderer
 
 EVERY_PHOTO = 10**6
 
@@ -66,11 +70,6 @@ def train(workspace: Path, case: Case) -> float:
 
 def frame_seconds(workspace: Path, width: int) -> tuple[float, str]:
     """How long a held-out view takes to draw at a width, and its size; the best of two."""
-    import numpy as np
-
-    from stages.render.path import CameraPath, path_rays
-    from stages.render.renderer import load_renderer
-
     scene = read_scene(stage_folder(workspace, "scene.json"))
     view = scene.of_split("test")[0]
     path = CameraPath((scene.cameras[view.camera],), np.asarray(view.scene_from_camera)[None]).resized(width)

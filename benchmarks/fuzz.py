@@ -19,7 +19,11 @@ import time
 from pathlib import Path
 from typing import Any
 
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import seed as seeded
+
 from benchmarks.record import Record, add_out
+from tests.fuzz.loaders import LOADERS, SECONDS, attempt
 
 MEMORY = 3 << 30  # bytes of data that a child may have; torch and its like take one gigabyte of it
 ROUND_SECONDS = 60.0  # each loader in turn
@@ -39,8 +43,6 @@ def main() -> int:
     if given.child:
         print(json.dumps(attack(given.child[0], float(given.child[1]), given.seed)))
         return 0
-    from tests.fuzz.loaders import LOADERS
-
     table = run(given.only or list(LOADERS), 60 * given.minutes, given.seed, given.keep)
     print_table(table, given.seed, given.out)
     return int(any(row["faults"] for row in table.values()))
@@ -79,12 +81,6 @@ def _child(name: str, seconds: float, seed: int, keep: Path) -> dict[str, Any]:
 
 def attack(name: str, seconds: float, seed: int) -> dict[str, Any]:
     """What one loader did with all the cases that fit into the time."""
-    from hypothesis import HealthCheck, Phase, given, settings
-    from hypothesis import seed as seeded
-
-    import stages.sfm.colmap  # noqa: F401
-    from tests.fuzz.loaders import LOADERS, SECONDS, attempt
-
     loader, counts, faults = LOADERS[name], {"tried": 0, "refused": 0}, []
     faulthandler.register(signal.SIGPROF, chain=True)  # says where it was and ends the process
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))

@@ -14,22 +14,21 @@ import shutil
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from benchmarks.record import Record, add_out
 from nerf import REGION_HALF
+from nerf.geometry.scene import Scene
 from pipeline.demo.truth import Truth, compare_with_truth
 from pipeline.engine.workspace import Workspace
 from stages.contract import Inputs
 from stages.mesh import Config
 from stages.mesh.extraction import extract_mesh, load, write_mesh
+from stages.mesh.files import ColouredMesh
 from stages.mesh.surface import sample_surface
-
-if TYPE_CHECKING:
-    from nerf.geometry.scene import Scene
-    from stages.mesh.files import ColouredMesh
 
 SAMPLES = 200_000  # of the mesh
 
@@ -56,8 +55,6 @@ def to_truth(mesh: "ColouredMesh", scene: "Scene", normalise: Path, truth: Truth
 
 def to_points(mesh: "ColouredMesh", points: np.ndarray) -> dict[str, float]:
     """From the sparse points in the region to the mesh: median, and nine in ten, in percent of the region's size."""
-    from scipy.spatial import KDTree
-
     inside = points[np.abs(points).max(1) < REGION_HALF]
     distance = KDTree(sample_surface(mesh.vertices, mesh.faces, SAMPLES, seed=0)).query(inside)[0]
     median, most = np.percentile(distance, [50, 90]) * 100 / (2 * REGION_HALF)

@@ -6,17 +6,19 @@ Small on purpose: photos of 320 × 240, a dozen each, one lens and one walk unle
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+import cv2
 import numpy as np
+import torch
 from jaxtyping import Float
+from PIL import Image
 
+from nerf.geometry.camera_paths import look_at
 from nerf.geometry.scene import Camera
-
-if TYPE_CHECKING:
-    import torch
-
-    from nerf.synthetic.scenes import SyntheticScene
+from nerf.synthetic.scenes import SyntheticScene, photograph, ring_of_cameras, still_life
+from nerf.synthetic.shapes import Frustum
+from stages.sfm.colmap.cameras import camera_rays
 
 WIDTH, HEIGHT = 320, 240
 LENS = Camera("OPENCV", WIDTH, HEIGHT, (334.0, 333.0, 160.8, 119.5, -0.085, 0.032, 0.0011, -0.0008))
@@ -56,16 +58,12 @@ def exposed(picture: Picture, index: int) -> Picture:
 
 def every_fifth_blurred(picture: Picture, index: int) -> Picture:
     """Every fifth photo smeared along 15 pixels, as a shaken camera does it."""
-    import cv2
-
     kernel = np.full((1, 15), 1 / 15)
     return cv2.filter2D(picture, -1, kernel) if index % 5 == 2 else picture
 
 
 def shoot(folder: Path, shots: Sequence[Shot], develop: Callable[[Picture, int], Picture] = as_taken) -> None:
     """Draw every shot into ``folder`` as PNG; ``develop`` gets each picture and its number."""
-    from PIL import Image
-
     for index, shot in enumerate(shots):
         picture = develop(_picture(shot.camera, shot.pose.tobytes(), shot.scene), index)
         path = folder / shot.name
@@ -75,10 +73,6 @@ def shoot(folder: Path, shots: Sequence[Shot], develop: Callable[[Picture, int],
 
 @cache  # many sets share photos
 def _picture(camera: Camera, pose: bytes, scene: int) -> Picture:
-    import torch
-
-    from nerf.synthetic.scenes import photograph
-
     with torch.inference_mode():
         world_from_camera = torch.tensor(np.frombuffer(pose).reshape(3, 4), dtype=torch.float32)
         return photograph(_scene(scene), _bearings(camera), world_from_camera, 2).double().numpy()
@@ -86,18 +80,11 @@ def _picture(camera: Camera, pose: bytes, scene: int) -> Picture:
 
 @cache
 def _bearings(camera: Camera) -> "torch.Tensor":
-    import torch
-
-    from stages.sfm.colmap.cameras import camera_rays
-
     return torch.from_numpy(camera_rays(camera, 2 * camera.width, 2 * camera.height))
 
 
 @cache
 def _scene(number: int) -> "SyntheticScene":
-    from nerf.synthetic.scenes import still_life
-    from nerf.synthetic.shapes import Frustum
-
     if number != PLANE:
         return still_life(number)
     table = still_life(3)
@@ -106,8 +93,6 @@ def _scene(number: int) -> "SyntheticScene":
 
 def walk(count: int, of: int = 36, start: int = 0) -> Poses:
     """``count`` of ``of`` poses on a walk around the still life, from number ``start`` on."""
-    from nerf.synthetic.scenes import ring_of_cameras
-
     return ring_of_cameras(of)[start : start + count]
 
 
@@ -125,8 +110,6 @@ def along(poses: Poses, camera: Camera = LENS, scene: int = 0, prefix: str = "ph
 
 def on_the_spot(count: int = 12) -> Poses:
     """One place, and the camera turned to look here and there on the table."""
-    from nerf.geometry.camera_paths import look_at
-
     centre = np.array([2.6, 0.0, 1.6])
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
     aims = np.stack([np.zeros(count), 0.5 * np.cos(angles), 0.2 + 0.4 * np.sin(angles)], axis=1)

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import pytest
 
 from nerf.geometry.scene import Camera
+from nerf.synthetic.scenes import ring_of_cameras
+from pipeline.demo import write_photos
 from pipeline.demo.truth import Truth
 
 LENS = Camera("OPENCV", 240, 180, (250.5, 249.75, 120.6, 89.65, -0.085, 0.032, 0.0011, -0.0008))
@@ -26,9 +28,6 @@ def synthetic_photos(tmp_path_factory: pytest.TempPathFactory) -> SyntheticPhoto
 
 def write_synthetic_photos(folder: Path) -> SyntheticPhotos:
     """The same in a folder of one's own."""
-    from nerf.synthetic.scenes import ring_of_cameras
-    from pipeline.demo import write_photos
-
     poses = {f"photo_{index:03d}.jpg": pose for index, pose in enumerate(ring_of_cameras(36)[:12])}
     truth = Truth(LENS, poses, seed=0)
     write_photos(folder, truth, Quiet())

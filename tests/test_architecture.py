@@ -2,7 +2,6 @@
 
 import ast
 import graphlib
-import inspect
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -10,6 +9,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+
+from pipeline.engine.stage_list import STAGES
+from stages.contract import StageConfig
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("nerf", "stages", "pipeline")
@@ -27,7 +29,16 @@ ALLOWED_BASES = {"Module", "Function", "Exception", "BaseException", "Enum", "In
     "Options",
     "StageConfig",
 }
-HEAVY = ("torch", "pycolmap", "kornia", "cv2", "trimesh", "skimage", "scipy", "matplotlib", "PIL", "warp")
+# 20 ms to 4 s each, so the command line starts without them.
+SLOW = {
+    *("torch", "warp", "pycolmap", "kornia", "cv2", "trimesh", "skimage", "scipy", "matplotlib", "PIL", "pillow_heif"),
+    *("numpy", "jaxtyping", "safetensors", "jinja2", "rich", "fast_simplification", "imageio_ffmpeg"),
+}
+ONLY_ON_UNIX = {"resource", "fcntl", "termios"}
+LATE = {
+    "pipeline/__main__.py": "Ctrl-C ends the program quietly while Python still reads it",
+    "benchmarks/nerfacto.py": "a part runs in nerfstudio's environment, where ours is not installed",
+}
 NO_SUBJECT = ("utils.py", "util.py", "helpers.py", "misc.py", "common.py")
 BACKENDS = ("torch", "warp")
 BANNED_CALLS = ("cumprod", "torch.load", "eval")
@@ -102,24 +113,61 @@ def dotted(module: Module) -> str:
     return module.name.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
 
 
+def imports_of(tree: ast.AST, in_function: bool = False) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
+    """Imports that run, and whether in a function; those for types alone do not."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            yield node, in_function
+        elif not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"):
+            yield from imports_of(node, in_function or isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))
+
+
+def loaded_by(node: ast.Import | ast.ImportFrom, known: Iterable[str]) -> set[str]:
+    """Modules that an import loads, the packages around them not counted."""
+    if isinstance(node, ast.Import):
+        return {alias.name for alias in node.names}
+    names = {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name if name in known else node.module or "" for name in names}
+
+
+def with_packages(name: str) -> set[str]:
+    """a.b.c → a, a.b, a.b.c: all are loaded."""
+    parts = name.split(".")
+    return {".".join(parts[:count]) for count in range(1, len(parts) + 1)}
+
+
+def late_imports(modules: Iterable[Module]) -> list[str]:
+    """Imports in functions that keep nothing slow out of the start: the module loads what is slow anyway, or what it
+    imports late is not slow."""
+    by_name = {dotted(module): module for module in modules}
+    found = {name: [*imports_of(module.tree)] for name, module in by_name.items()}
+    loaded = {
+        name: {
+            part
+            for node, late in found[name]
+            if not late
+            for n in loaded_by(node, by_name)
+            for part in with_packages(n)
+        }
+        | (with_packages(name) - {name})
+        for name in by_name
+    }
+    slow = set(SLOW)
+    while more := {name for name in loaded if name not in slow and loaded[name] & slow}:
+        slow |= more
+    wrong = []
+    for name, module in by_name.items():
+        late = [node for node, in_function in found[name] if in_function and module.name not in LATE]
+        for node in late:
+            parts = {part for loaded in loaded_by(node, by_name) for part in with_packages(loaded)}
+            if (name in slow or not parts & slow) and not parts & ONLY_ON_UNIX:
+                wrong.append(f"{module.name}: {ast.unparse(node)}")
+    return wrong
+
+
 def modules_imported(module: Module, known: set[str]) -> set[str]:
     """Modules among ``known`` that this one imports as it runs, at its top or in a function."""
-    only_for_types = {
-        id(node)
-        for test in ast.walk(module.tree)
-        if isinstance(test, ast.If) and ast.unparse(test.test) == "TYPE_CHECKING"
-        for node in ast.walk(test)
-    }
-    found: set[str] = set()
-    for node in ast.walk(module.tree):
-        if id(node) in only_for_types:
-            continue
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            inside = {f"{node.module}.{alias.name}" for alias in node.names}
-            found |= {name if name in known else node.module for name in inside}
-    return found & known
+    return {name for node, _ in imports_of(module.tree) for name in loaded_by(node, known)} & known
 
 
 def cycle(modules: Iterable[Module]) -> list[str]:
@@ -237,6 +285,17 @@ def test_no_modules_import_each_other_in_a_circle():
     assert cycle([module("a.py", types), module("b.py", "import a")]) == []
 
 
+def test_only_slow_imports_stand_in_functions():
+    unsettled = ("stages/effects/", "stages/evaluate/", "stages/train/")
+    assert [wrong for wrong in late_imports([*OURS, *AROUND]) if not wrong.startswith(unsettled)] == []
+    late = "def f():\n    import %s"
+    light, heavy = module("light.py", "import math"), module("heavy.py", "import torch.nn")
+    assert late_imports([light, heavy, module("a.py", late % "heavy"), module("b.py", late % "torch")]) == []
+    assert late_imports([light, module("a.py", late % "light")]) == ["a.py: import light"]
+    assert late_imports([heavy, module("a.py", f"import heavy\n{late % 'kornia'}")]) == ["a.py: import kornia"]
+    assert late_imports([module("a/__init__.py", "import cv2"), module("a/b.py", late % "scipy")]) != []
+
+
 def test_packages_of_pipeline_import_one_way():
     assert offenders(imports_out_of_order, OURS) == []
 
@@ -340,15 +399,12 @@ def test_who_breaks_a_rule_is_found(rule: Rule):
 def test_the_command_line_starts_without_heavy_imports():
     code = "import sys, pipeline.cli.commands; print([m for m in sys.argv[1].split() if m in sys.modules])"
     answer = subprocess.run(
-        [sys.executable, "-c", code, " ".join(HEAVY)], cwd=ROOT, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code, " ".join(SLOW)], cwd=ROOT, capture_output=True, text=True, check=True
     )
     assert answer.stdout.strip() == "[]"
 
 
 def test_every_stage_keeps_the_contract():
-    from pipeline.engine.stage_list import STAGES
-    from stages.contract import StageConfig
-
     assert len({module.EXIT_CODE for module in STAGES.values()}) == len(STAGES)
     seen: list[str] = []
     for name, module in STAGES.items():
@@ -361,12 +417,6 @@ def test_every_stage_keeps_the_contract():
 
 
 def test_options_are_documented():
-    from pipeline.engine.stage_list import STAGES
-
-    for name, module in STAGES.items():
-        source = Path(inspect.getsourcefile(module.Config) or "").read_text("utf-8")
-        config = next(n for n in ast.parse(source).body if isinstance(n, ast.ClassDef) and n.name == "Config")
-        for field, following in zip(config.body, [*config.body[1:], None], strict=True):
-            if isinstance(field, ast.AnnAssign):
-                documented = isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)
-                assert documented or "description" in ast.unparse(field), f"{name}.{ast.unparse(field.target)}"
+    options = [(f"{stage}.{name}", option) for stage in STAGES for name, option in STAGES[stage].Config.flags()]
+    assert "train.grid.max_res" in dict(options)
+    assert [name for name, option in options if not option.description] == []

@@ -362,9 +362,9 @@ def command_doctor(words: Sequence[str]) -> int:
 
 def command_demo(words: Sequence[str]) -> int:
     """``pipeline demo``: photograph a synthetic scene, run everything, compare with the truth."""
+    given = arguments.parse(arguments.DemoArguments, "demo", words)
     from pipeline import demo
 
-    given = arguments.parse(arguments.DemoArguments, "demo", words)
     if given.budget is None:
         given = arguments.parse(arguments.DemoArguments, "demo", words, demo.default_settings())
     budget = _budget(given.budget, given.settings)

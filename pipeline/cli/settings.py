@@ -13,6 +13,7 @@ from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace, is_result, lasting, photo_set
 from stages.contract import bounded
 from stages.effects.effect_list import EFFECTS
+from stages.ingest.sources import find_source, is_gone
 from stages.train.config import OPTIONS_OF_FIELD
 
 if TYPE_CHECKING:
@@ -91,8 +92,6 @@ def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Setti
     """The settings with PHOTOS (and known cameras, if any) filled in. Raises StageError where PHOTOS is unusable,
     UsageError where the photo to render like is none of them or the cameras to render are not there: better now than
     after the training."""
-    from stages.ingest.sources import find_source
-
     source = find_source(photos, cameras)
     names, like = [source.name(file) for file in source.files], settings.render.match_exposure
     if like is not None and source.kind != "video" and like not in names:
@@ -148,8 +147,6 @@ def check_workspace(root: Path, photos: Path) -> None:
 def check_same_photos(workspace: Workspace, photos: Path) -> None:
     """Raises UsageError where a workspace that nobody named was made from another set of photos that is still there:
     its results would make way for those of PHOTOS. Where the old one is gone, it was moved or renamed."""
-    from stages.ingest.sources import is_gone
-
     recorded = workspace.read_run().options.get("ingest", {}).get("photos")
     if not isinstance(recorded, str) or is_gone(Path(recorded)) or is_gone(photos):
         return

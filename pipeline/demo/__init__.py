@@ -3,19 +3,20 @@
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from PIL import Image
 
 from nerf.geometry.scene import Camera
+from nerf.synthetic import scenes
+from nerf.synthetic.scenes import SyntheticScene, ring_of_cameras, still_life
 from pipeline.demo.truth import Truth, compare_with_truth
 from pipeline.engine.settings import Settings
 from stages.contract import Progress, StageError
+from stages.io.files import read_json
+from stages.sfm.colmap.cameras import camera_rays
 from stages.train import Config as TrainConfig
-
-if TYPE_CHECKING:
-    import numpy as np
-    import torch
-
-    from nerf.synthetic.scenes import SyntheticScene
 
 PHOTOS = 40
 SEED = 0
@@ -52,16 +53,12 @@ def photograph(folder: Path, progress: Progress) -> tuple[str, float]:
 
 def demo_truth(lens: Camera, count: int, seed: int) -> Truth:
     """``count`` photos around the still life of ``seed``, all taken with one camera."""
-    from nerf.synthetic.scenes import ring_of_cameras
-
     poses = {f"photo_{index:03d}.jpg": pose for index, pose in enumerate(ring_of_cameras(count, seed))}
     return Truth(lens, poses, seed)
 
 
 def write_photos(folder: Path, truth: Truth, progress: Progress) -> None:
     """Draw every photo of ``truth`` into ``folder``; truth.json beside it comes last and marks them complete."""
-    import torch
-
     folder.mkdir(parents=True, exist_ok=True)
     truth_file(folder).unlink(missing_ok=True)
     scene, directions = _scene_and_directions(truth)
@@ -78,24 +75,14 @@ def write_photos(folder: Path, truth: Truth, progress: Progress) -> None:
     truth.write(truth_file(folder))
 
 
-def _scene_and_directions(truth: Truth) -> "tuple[SyntheticScene, torch.Tensor]":
+def _scene_and_directions(truth: Truth) -> tuple[SyntheticScene, torch.Tensor]:
     """The scene, and the unit ray directions of a grid of points inside every pixel, lens distortion included."""
-    import torch
-
-    from nerf.synthetic.scenes import still_life
-    from stages.sfm.colmap.cameras import camera_rays
-
     camera = truth.camera
     rays = camera_rays(camera, SAMPLES_PER_SIDE * camera.width, SAMPLES_PER_SIDE * camera.height)
     return still_life(truth.seed), torch.from_numpy(rays)
 
 
-def _draw(path: Path, scene: "SyntheticScene", directions: "torch.Tensor", pose: "np.ndarray") -> None:
-    import torch
-    from PIL import Image
-
-    from nerf.synthetic import scenes
-
+def _draw(path: Path, scene: SyntheticScene, directions: torch.Tensor, pose: np.ndarray) -> None:
     with torch.inference_mode():
         image = scenes.photograph(scene, directions, torch.tensor(pose, dtype=torch.float32), SAMPLES_PER_SIDE)
     pixels = (255 * image).round().byte().numpy()
@@ -113,8 +100,6 @@ def truth_lines(output: Path, photos: Path) -> list[str]:
 
 
 def _is_done(folder: Path, truth: Truth) -> bool:
-    from stages.io.files import read_json
-
     try:
         known = read_json(truth_file(folder))
     except StageError:  # not there, or its writing was cut short

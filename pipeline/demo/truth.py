@@ -7,20 +7,20 @@ frame is arbitrary, so it is first brought onto the truth by the similarity that
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+import trimesh
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from nerf.geometry.alignment import align
 from nerf.geometry.scene import Camera, Similarity
+from nerf.synthetic.scenes import TABLE_RADIUS, SyntheticScene, still_life
 from stages.io.files import read_json, write_json
 from stages.io.transforms_export import OPENGL_FROM_OPENCV
-
-if TYPE_CHECKING:
-    import torch
-
-    from nerf.synthetic.scenes import SyntheticScene
+from stages.mesh.surface import sample_surface
 
 MAX_ROTATION_DEG, MAX_POSITION_PERCENT = 0.5, 1.0  # what the demo promises of its worst camera
 MESH_SAMPLES = 200_000  # on a perfect mesh these are 0.17 % of the scene's size from a point at random
@@ -108,8 +108,6 @@ def compare_with_truth(output: Path, truth: Truth) -> Comparison:
 
     Raises StageError for a missing or damaged transforms.json, ValueError if too few cameras are registered.
     """
-    from nerf.synthetic.scenes import TABLE_RADIUS
-
     content = read_json(output / "transforms.json")
     found = {frame["photo"]: np.array(frame["transform_matrix"])[:3] for frame in content["frames"]}
     names = sorted(found)
@@ -143,13 +141,6 @@ def _focal_percent(transforms: Mapping[str, Any], camera: Camera) -> float:
 
 
 def _mesh_error(mesh: Path, truth_from_sfm: Similarity, truth: Truth, percent: float) -> MeshError:
-    import torch
-    import trimesh
-    from scipy.spatial import KDTree
-
-    from nerf.synthetic.scenes import still_life
-    from stages.mesh.surface import sample_surface
-
     loaded = trimesh.load_mesh(mesh, process=False)
     vertices = truth_from_sfm.points(np.asarray(loaded.vertices, float))
     sampled = sample_surface(vertices, np.asarray(loaded.faces), MESH_SAMPLES, seed=0)
@@ -162,15 +153,11 @@ def _mesh_error(mesh: Path, truth_from_sfm: Similarity, truth: Truth, percent: f
     return MeshError(accuracy, completeness, (accuracy + completeness) / 2)
 
 
-def seen(
-    scene: "SyntheticScene", points: "torch.Tensor", normals: "torch.Tensor", centres: "torch.Tensor"
-) -> "torch.Tensor":
+def seen(scene: SyntheticScene, points: torch.Tensor, normals: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
     """Which surface points (n, 3) face at least one of the camera centres (m, 3) with nothing in between.
 
     The edges of the photos are not looked at: all of them show nearly the whole still life.
     """
-    import torch
-
     visible = torch.zeros(len(points), dtype=torch.bool)
     for centre in centres:
         (open_,) = torch.where(~visible & ((normals * (centre - points)).sum(-1) > 0))

@@ -5,6 +5,8 @@
 import platform
 from pathlib import Path
 
+import torch
+
 from pipeline.doctor.bench import bench_lines
 from pipeline.doctor.selftest import numerical_matrix, self_test
 from pipeline.engine import machine
@@ -21,8 +23,6 @@ LOW_DISK_GB = 2.0
 def examine(folder: Path, selftest: bool, bench: bool) -> int:
     """Print versions, device, threads, free disk, the hash-grid field's kernels and the self-test, the long one and the
     machine's rates if asked for. 0 if all is well, 1 otherwise."""
-    import torch
-
     print(f"python {platform.python_version()} on {platform.platform()}")
     found = machine.versions(PACKAGES)
     print("\n".join(f"  {name:<32} {version}" for name, version in found.items()))

@@ -1,11 +1,18 @@
 """``pipeline doctor --bench``: what this machine can do, and how fast training could be with nothing else to do."""
 
-from typing import TYPE_CHECKING
+import torch
 
-if TYPE_CHECKING:
-    import torch
-
-    from nerf.runtime.profiler import WorkCounts
+from nerf.fields import mlp
+from nerf.fields.hash_grid import CORNERS, HashGridField
+from nerf.fields.vanilla import VanillaNerf, VanillaSettings
+from nerf.kernels import torch as reference
+from nerf.runtime.machine_rates import Rates, copied_bytes, measure_copy, measure_gather, measure_matmul
+from nerf.runtime.profiler import WorkCounts
+from nerf.training.hash_grid_trainer import ADAM_BYTES
+from stages.amounts import bytes_in_words, short_count
+from stages.hardware.device import compute_device, cores
+from stages.train.config import Config
+from stages.train.fields.hash_grid import SAMPLES_PER_RAY, field_settings, rays_per_step, timed, with_defaults
 
 SECONDS = 0.3  # for each rate
 TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all of a large field
@@ -17,12 +24,8 @@ WHERE = {"bounded": "around an object", "contracted": "in unbounded space"}
 VANILLA_RAYS = {"vanilla NeRF as published": (8, 256, 64, 128), "vanilla NeRF 4 × 64": (4, 64, 32, 32)}
 
 
-def bench_lines(device: "torch.device") -> list[str]:
+def bench_lines(device: torch.device) -> list[str]:
     """Measure, and the table in lines."""
-    from nerf.runtime.machine_rates import copied_bytes, measure_copy, measure_gather, measure_matmul
-    from stages.amounts import bytes_in_words
-    from stages.hardware.device import compute_device, cores
-
     compute_device()
     count = cores()
     products = {width: measure_matmul(device, width, SECONDS) for width in (64, 256)}
@@ -47,11 +50,6 @@ def _line(name: str, rate: float, count: int, unit: str) -> str:
 
 def _meaning(products: dict[int, float], reads: float, copied: float, count: int) -> list[str]:
     """What training can reach here at most: the work of a ray that nothing can save, at these rates."""
-    from nerf.runtime.machine_rates import Rates
-    from nerf.runtime.profiler import WorkCounts
-    from stages.amounts import short_count
-    from stages.train.fields.hash_grid import SAMPLES_PER_RAY
-
     lines = ["at these rates, with nothing else to do and no core waiting, training would reach"]
     for space, densities in DENSITIES.items():
         work = grid_work(space == "contracted", densities)
@@ -64,18 +62,9 @@ def _meaning(products: dict[int, float], reads: float, copied: float, count: int
     return lines
 
 
-def grid_work(contracted: bool, densities: float) -> "WorkCounts":
+def grid_work(contracted: bool, densities: float) -> WorkCounts:
     """Of a ray in training, its share of the optimiser's included: a large field, in the steps that stage train takes
     on this machine."""
-    from nerf.fields import mlp
-    from nerf.fields.hash_grid import CORNERS, HashGridField
-    from nerf.kernels import torch as reference
-    from nerf.runtime.profiler import WorkCounts
-    from nerf.training.hash_grid_trainer import ADAM_BYTES
-    from stages.hardware.device import compute_device
-    from stages.train.config import Config
-    from stages.train.fields.hash_grid import SAMPLES_PER_RAY, field_settings, rays_per_step, timed, with_defaults
-
     asked = Config(contracted=contracted, view_dependence=True)
     config = timed(with_defaults(asked), compute_device())
     model = HashGridField(field_settings(config, sky=False), 0, reference)
@@ -88,7 +77,5 @@ def grid_work(contracted: bool, densities: float) -> "WorkCounts":
 
 def vanilla_flops(depth: int, width: int, coarse: int, fine: int) -> int:
     """Multiplications and additions of a ray of the vanilla NeRF in training."""
-    from nerf.fields.vanilla import VanillaNerf, VanillaSettings
-
     model = VanillaNerf(VanillaSettings(depth=depth, width=width, samples_coarse=coarse, samples_fine=fine), 0)
     return model.settings.queries_per_ray * (model.fine.matmul_flops + model.fine.matmul_flops_backward)

@@ -2,18 +2,20 @@
 docs/NUMERICS.md."""
 
 import time
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    import torch
+import torch
 
-    from nerf.kernels import Backend
-    from pipeline.doctor.numerics.matrix import Row
+from nerf.fields.vanilla import VanillaNerf, VanillaSettings
+from nerf.geometry.rays import Rays
+from nerf.kernels import Backend
+from nerf.rendering.volume_rendering import composite
+from pipeline.doctor.numerics.matrix import Row, figure, limit, matrix
+from stages.hardware.backend import chosen_backend, load_backend
 
 HEADER = f"  {'':<7}{'formula':<58} {'on':<6}{'value':>7}  {'limit':<18} {'gradient':>8}  limit"
 
 
-def self_test(device: "torch.device") -> list[tuple[str, str]]:
+def self_test(device: torch.device) -> list[tuple[str, str]]:
     """(check, error or "") for each check, printed as it goes."""
     results = []
     for name, check in (
@@ -29,12 +31,8 @@ def self_test(device: "torch.device") -> list[tuple[str, str]]:
     return results
 
 
-def _check_fog(device: "torch.device") -> str:
+def _check_fog(device: torch.device) -> str:
     """Constant density over [0, 2] has opacity 1 - exp(-2 sigma), however it is cut into intervals."""
-    import torch
-
-    from nerf.rendering.volume_rendering import composite
-
     t = torch.linspace(0, 2, 129, device=device)[None]
     sigma = torch.full((1, 128), 0.7, device=device)
     rendering, _ = composite(sigma, sigma.new_ones(1, 128, 3), t, sigma.new_zeros(3))
@@ -42,11 +40,7 @@ def _check_fog(device: "torch.device") -> str:
     return "" if error < 1e-5 else f"opacity is off by {error:.1e}"
 
 
-def _check_gradient(device: "torch.device") -> str:
-    import torch
-
-    from nerf.rendering.volume_rendering import composite
-
+def _check_gradient(device: torch.device) -> str:
     t = torch.tensor([[0.1, 0.4, 0.9, 1.0, 2.0]], dtype=torch.float64, device=device)
     colour = torch.linspace(0, 1, 12, dtype=torch.float64, device=device).view(1, 4, 3)
     sigma = torch.tensor([[0.2, 3.0, 0.0, 9.0]], dtype=torch.float64, device=device, requires_grad=True)
@@ -57,11 +51,7 @@ def _check_gradient(device: "torch.device") -> str:
     return ""
 
 
-def _check_extremes(device: "torch.device") -> str:
-    import torch
-
-    from nerf.rendering.volume_rendering import composite
-
+def _check_extremes(device: torch.device) -> str:
     for extreme in (0.0, 1e-38, 1e-6, 1.0, 1e6, 1e30):
         sigma = torch.full((1, 8), extreme, device=device, requires_grad=True)
         rendering, _ = composite(
@@ -74,13 +64,8 @@ def _check_extremes(device: "torch.device") -> str:
     return ""
 
 
-def _check_learning(device: "torch.device") -> str:
+def _check_learning(device: torch.device) -> str:
     """Forward, backward and optimiser together: the loss must fall a hundredfold."""
-    import torch
-
-    from nerf.fields.vanilla import VanillaNerf, VanillaSettings
-    from nerf.geometry.rays import Rays
-
     settings = VanillaSettings(depth=2, width=32, skip=1, samples_coarse=8, samples_fine=8)
     model = VanillaNerf(settings, seed=0).to(device)
     optimiser = torch.optim.Adam(model.parameters(), lr=1e-2)
@@ -103,8 +88,6 @@ def _check_learning(device: "torch.device") -> str:
 
 def numerical_matrix(device: str) -> list[str]:
     """Print the table, a line for each formula and backend; what is wrong, in sentences."""
-    from pipeline.doctor.numerics.matrix import matrix
-
     started, wrong, count = time.monotonic(), [], 0
     print(f"numerical self-test on {device}: worst errors in float32 against float64")
     print(HEADER)
@@ -117,17 +100,13 @@ def numerical_matrix(device: str) -> list[str]:
     return wrong
 
 
-def _backends(device: str) -> "dict[str, Backend]":
+def _backends(device: str) -> dict[str, Backend]:
     """Torch's, and Warp's where they run."""
-    from stages.hardware.backend import chosen_backend, load_backend
-
     names = ("torch", "warp") if chosen_backend(device) == "warp" else ("torch",)
     return {name: load_backend(name, device) for name in names}
 
 
-def _lines(row: "Row") -> list[str]:
-    from pipeline.doctor.numerics.matrix import figure, limit
-
+def _lines(row: Row) -> list[str]:
     case, lines = row.case, []
     for name, found in row.measured.items():
         verdict = "ok" if found.within(case) else "FAILED"

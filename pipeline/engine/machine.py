@@ -6,6 +6,8 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from stages.hardware.device import processors
 
 
@@ -42,8 +44,6 @@ def free_bytes(folder: Path) -> int:
 
 def facts() -> dict[str, Any]:
     """What a manifest records about the machine (never part of a key)."""
-    import psutil
-
     return {
         "system": platform.platform(),
         "cores": processors(),

@@ -29,6 +29,7 @@ from pipeline.schedule.forecast import (
 )
 from stages.contract import StageConfig, StageError, Workload, declared, reading_seconds
 from stages.hardware.device import processors
+from stages.ingest.sources import find_source, is_gone
 from stages.io.photos import read_photos
 from stages.io.stopwatch import counting, elapsed, write_elapsed
 
@@ -370,8 +371,6 @@ class Runner:
 
     def _photos_digest(self) -> str:
         """Digest of the photos' names and bytes; the last known one where the photos are gone but were ingested."""
-        from stages.ingest.sources import find_source, is_gone
-
         if self.photos is not None:
             return self.photos
         config: Any = self.options[SOURCE]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from pipeline.schedule.budget import Stages, Times, max_total, min_total
 from stages.amounts import duration, rough_duration
 from stages.contract import BudgetLeft, Photos, StageConfig, StageError, Workload, declared
+from stages.ingest.sources import find_source
 
 if TYPE_CHECKING:
     from stages.ingest import Config as IngestConfig
@@ -17,7 +18,6 @@ UNREADABLE_PIXELS = 2_000_000  # that a photo is taken to have until ingest says
 def photos_of(config: "IngestConfig") -> Photos | None:
     """What is to be seen of the photos without decoding any; None where they are gone or cannot be used."""
     from stages.ingest.decoding import pixel_count
-    from stages.ingest.sources import find_source
     from stages.ingest.video_frames import expected_frames
 
     try:

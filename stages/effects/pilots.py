@@ -14,6 +14,7 @@ from stages.effects.decisions import Decisions, image_effects
 from stages.effects.effect_list import EFFECTS
 from stages.evaluate.image_metrics import MIN_FOR_INTERVAL, mean_interval
 from stages.train.config import BLACK
+from stages.train.fields.hash_grid_options import HashGridOptions
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -172,7 +173,6 @@ def _config(arm: Decisions, steps: int, device: str) -> "TrainConfig":
     from stages.hardware.backend import chosen_backend
     from stages.train.config import Config
     from stages.train.fields.field_list import with_defaults
-    from stages.train.fields.hash_grid_options import HashGridOptions
 
     return with_defaults(
         Config(

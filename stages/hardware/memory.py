@@ -7,8 +7,15 @@ shell to that of ``ulimit``. Whoever goes beyond is killed without a word, after
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
+
 from stages.amounts import bytes_in_words
 from stages.contract import StageError
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
 
 GROUPS = Path("/sys/fs/cgroup")
 OF_PROCESS = Path("/proc/self/cgroup")
@@ -21,8 +28,6 @@ NAMES = {
 
 def available_bytes() -> int:
     """Memory that this process may still take: the least that the machine, its groups and its limits leave."""
-    import psutil
-
     rooms = [psutil.virtual_memory().available, *rooms_in_groups(OF_PROCESS, GROUPS), *_rooms_in_limits()]
     return max(0, min(rooms))
 
@@ -86,12 +91,8 @@ def _room(folder: Path, limit: str, taken: str, cached: str) -> int | None:
 
 def _rooms_in_limits() -> Iterator[int]:
     """What ``ulimit -v`` and ``ulimit -d`` leave, where the system has them."""
-    try:
-        import resource
-    except ImportError:  # Windows
+    if resource is None:
         return
-    import psutil
-
     taken = psutil.Process().memory_info()
     for limit, used in ((resource.RLIMIT_AS, taken.vms), (resource.RLIMIT_DATA, getattr(taken, "data", 0))):
         most = resource.getrlimit(limit)[0]

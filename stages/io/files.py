@@ -5,6 +5,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from pydantic import TypeAdapter, ValidationError
+
 from stages.contract import StageError, bounded
 
 if TYPE_CHECKING:
@@ -48,8 +50,6 @@ def read_dataclass(path: Path, kind: type[T]) -> T:
 
     Raises StageError where it is missing or damaged.
     """
-    from pydantic import TypeAdapter, ValidationError
-
     try:
         return TypeAdapter(kind).validate_json(path.read_bytes(), strict=True)
     except OSError as error:

@@ -1,38 +1,14 @@
 """Stage render: a video of the field, and one of its depth."""
 
-import difflib
 import time
-from collections.abc import Iterator
-from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from pydantic import Field, field_validator
 
-from stages.amounts import duration, short_count
-from stages.contract import (
-    Flexible,
-    Inputs,
-    Progress,
-    StageConfig,
-    StageError,
-    StageResult,
-    Workload,
-)
-from stages.io.files import read_json, read_scene, write_json, write_png
-from stages.io.photos import spread
-from stages.render.path import CameraPath, PathKind, fitted_path, path_from_file, path_rays, usual_path
-from stages.render.plan import MIN_WIDTH, even_width
+from stages.contract import Flexible, Inputs, Progress, StageConfig, StageResult, Workload
+from stages.io.files import read_scene, write_json
+from stages.render.plan import MIN_WIDTH, PathKind, even_width
 from stages.train import trained_seconds
-
-if TYPE_CHECKING:
-    import numpy as np
-    from torch import Tensor
-
-    from nerf.fields.interface import Rendering
-    from nerf.geometry.rays import Rays
-    from nerf.geometry.scene import Scene
-    from stages.render.renderer import Allowance, Renderer
 
 INPUTS = ("normalise", "train")
 VERSION = 13
@@ -41,11 +17,6 @@ RESUMES = False
 PUBLISHED = ("video.mp4", "depth.mp4", "path.json")
 NOT_HASHED = ("seconds",)  # it decides how many frames and how large, and these enter the key
 FLEXIBLE = Flexible(share=0.15, min_seconds=4.0, max_seconds=300.0)
-
-STARTING_SECONDS = 1.0  # to load the field once more and to write what is not video
-TRIED_VIEWS = 4  # of the path, to see how fast the field draws them
-BYTES_PER_PIXEL = 200  # of a frame while it is drawn and written: rays, colours, depth; 105 to 195 measured
-WRITING_SECONDS = 1.5e-7  # to encode a pixel of video.mp4 and of depth.mp4 (x264 with one thread: 13 million a second)
 
 
 class Config(StageConfig):
@@ -100,239 +71,31 @@ def expected_seconds(config: Config, workload: Workload) -> float | None:
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Choose path, frames, width and fps; frames and width by how fast this machine draws pictures along the path."""
-    from stages.render.plan import chosen_fps
-    from stages.render.renderer import Allowance
+    from stages.render.video import planned
 
-    _check(config)
-    scene = read_scene(inputs["normalise"])
-    if config.cameras is None:
-        config = config.model_copy(update={"path": config.path or usual_path(scene)})
-    path = _path(config, scene)
-    frames = len(path.cameras) if config.cameras else config.frames
-    width = config.width
-    if frames is None or width is None:
-        downscale = 1 if config.cameras else read_json(inputs["train"] / "field.json")["downscale"]
-        allowance = Allowance(config.seconds, inputs["train"], STARTING_SECONDS)
-        frames, width = _affordable(path, scene, inputs["train"], downscale, (frames, width), allowance, progress)
-    kept = None if config.cameras else frames
-    return config.model_copy(update={"frames": kept, "width": width, "fps": config.fps or chosen_fps(frames)})
-
-
-def _affordable(
-    path: CameraPath,
-    scene: "Scene",
-    train: Path,
-    downscale: float,
-    asked: tuple[int | None, int | None],
-    allowance: "Allowance",
-    progress: Progress,
-) -> tuple[int, int]:
-    """(frames, width), where not asked for as many and as large as may be drawn in the time allowed."""
-    from stages.render.plan import affordable, longest_side
-    from stages.render.renderer import measured_speed
-
-    camera = path.cameras[0]
-    progress.update("trying how fast the field draws")
-    longest = longest_side(camera, downscale)
-    drawn = measured_speed(train, lambda side: _tried_rays(path, scene, side), int(longest))
-    speed = 1 / (1 / drawn + WRITING_SECONDS)
-    frames, width = affordable(allowance.left() * speed, camera, longest, *asked)
-    progress.note(_why(path.resized(width), frames, speed, allowance, asked))
-    return frames, width
-
-
-def _tried_rays(path: CameraPath, scene: "Scene", side: int) -> "Rays":
-    """Rays of a few frames, reduced to a long side of ``side`` pixels, one above the other."""
-    from nerf.geometry.rays import join_rays
-
-    camera = path.cameras[0]
-    count = len(path.cameras)
-    few = path.some(sorted(set(spread(count, TRIED_VIEWS))))
-    width = max(2, 2 * round(side * camera.width / max(camera.width, camera.height) / 2))
-    return join_rays(path_rays(few.resized(width), scene))
-
-
-def _why(
-    path: CameraPath, frames: int, rays_per_second: float, allowance: "Allowance", asked: tuple[int | None, int | None]
-) -> str:
-    """What was chosen, how long it takes, and where that is less or more than one would wish."""
-    from stages.render.plan import MIN_FRAMES, SMALL_SIDE
-
-    camera = path.cameras[0]
-    seconds = frames * camera.width * camera.height / rays_per_second
-    words = f"{short_count(rays_per_second)} rays/s here: {frames} frames {camera.width}×{camera.height} take about "
-    words += f"{duration(seconds)}, {allowance.words()}"
-    if seconds > (allowance.given or allowance.trained):
-        return f"{words}; that is longer, {'as asked' if any(asked) else 'but there is no smaller video'}"
-    small = (asked[0] is None and frames < MIN_FRAMES) or (
-        asked[1] is None and max(camera.width, camera.height) < SMALL_SIDE - 2
-    )
-    return f"{words}; more would take too long, --render.frames and --render.width ask for it" if small else words
-
-
-def _check(config: Config) -> None:
-    if config.cameras is not None and (config.path or config.frames):
-        raise StageError(
-            "render.cameras-and-path",
-            "--render.cameras excludes --render.path and --render.frames",
-            "the file says where the cameras stand and how many there are",
-            "Leave out one of them.",
-        )
+    return planned(config, inputs, progress)
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Render the path and write video.mp4, depth.mp4, path.json and, if asked, frames/."""
+    from stages.render import video
     from stages.render.renderer import load_renderer
 
     config = plan(config, inputs, progress)
     assert config.width is not None and config.fps is not None
     scene = read_scene(inputs["normalise"])
     renderer = load_renderer(inputs["train"], progress=progress)
-    gain, exposure = _exposure(config.match_exposure, inputs["train"], scene, progress)
+    gain, exposure = video.exposure(config.match_exposure, inputs["train"], scene, progress)
     renderer = renderer if gain is None else renderer.at_gain(gain)
-    path = _path(config, scene).resized(config.width)
-    _check_memory(path)
-    write_json(folder / "path.json", _path_json(path, scene, config.fps))
+    path = video.camera_path(config, scene).resized(config.width)
+    video.check_frame_memory(path)
+    write_json(folder / "path.json", video.path_json(path, scene, config.fps))
     started = time.perf_counter()
-    renderings = _render(path, scene, renderer, progress)
-    outputs = ("path.json", *_write(renderings, path, config, folder))
+    renderings = video.render_path(path, scene, renderer, progress)
+    outputs = ("path.json", *video.write_videos(renderings, path, config, folder))
     frames_per_second = len(path.cameras) / (time.perf_counter() - started)
     write_json(folder / "speed.json", {"frames_per_second": frames_per_second})
-    facts = _facts(config, path) | ({} if exposure is None else {"exposure": exposure})
+    facts = video.facts(config, path) | ({} if exposure is None else {"exposure": exposure})
     line = f"{facts['path']}, {facts['frames']} frames {facts['width']}×{facts['height']}"
     line += "" if exposure is None else f" · {exposure}"
     return StageResult(outputs, f"{line} · drawn at {frames_per_second:.2g} frames/s", ("speed.json",), facts)
-
-
-def _check_memory(path: CameraPath) -> None:
-    """Raises StageError where not even one frame can be drawn."""
-    from stages.hardware.memory import check_memory
-
-    camera = max(path.cameras, key=lambda camera: camera.width * camera.height)
-    size = f"{camera.width}×{camera.height}"
-    needed, hint = BYTES_PER_PIXEL * camera.width * camera.height, f"Try --render.width {camera.width // 2}."
-    check_memory(needed, "the video", f"drawing a frame of {size} takes", hint)
-
-
-def _path(config: Config, scene: "Scene") -> CameraPath:
-    """The cameras to render; of a path whose length is still open, MIN_FRAMES."""
-    from stages.render.plan import MIN_FRAMES
-
-    if config.cameras is not None:
-        return path_from_file(scene, config.cameras)
-    assert config.path is not None
-    return fitted_path(scene, config.path, config.frames or MIN_FRAMES)
-
-
-def _render(path: CameraPath, scene: "Scene", renderer: "Renderer", progress: Progress) -> "Iterator[Rendering]":
-    """The frames, one by one, on the CPU."""
-    count, started = len(path.cameras), time.perf_counter()
-    for index, rays in enumerate(path_rays(path, scene)):
-
-        def on_chunk(share: float, index: int = index) -> None:
-            done = (index + share) / count
-            left = (time.perf_counter() - started) * (1 - done) / done
-            progress.update(f"frame {index + 1} of {count} · {duration(left)} left", done)
-
-        yield renderer.draw(rays, on_chunk)
-
-
-def _write(renderings: "Iterator[Rendering]", path: CameraPath, config: Config, folder: Path) -> list[str]:
-    """Encode frames as they come; depth afterwards, for its colours need the range over the whole video."""
-    import numpy as np
-
-    from stages.io.video import video_writer
-
-    assert config.fps is not None
-    height, width = path.cameras[0].height, path.cameras[0].width
-    if config.save_frames:
-        (folder / "frames").mkdir()
-    waiting = folder / "inverse_depth.tmp"
-    # Written and not mapped: on a full disk a write raises OSError, where a mapping would kill the process.
-    with (
-        waiting.open("wb") if config.depth else nullcontext() as depths,
-        video_writer(folder / "video.mp4", width, height, config.fps) as add,
-    ):
-        for index, rendering in enumerate(renderings):
-            frame = (rendering.colour.clamp(0, 1) * 255).round().byte().numpy()
-            add(frame)
-            if depths is not None:
-                depths.write((1 / rendering.depth.numpy()).astype(np.float16).data)
-            if config.save_frames:
-                write_png(folder / "frames" / f"{index:05d}.png", frame)
-    if config.depth:
-        inverse = np.memmap(waiting, np.float16, "r", shape=(len(path.cameras), height, width))
-        _write_depth(inverse, folder / "depth.mp4", config.fps)
-        waiting.unlink()
-    return ["video.mp4"] + ["depth.mp4"] * config.depth + ["frames"] * config.save_frames
-
-
-def _write_depth(inverse: "np.ndarray", file: Path, fps: int) -> None:
-    """Inverse depth in colour, near red, far blue (turbo), on one scale from its 1 % to its 99 % quantile."""
-    import cv2
-    import numpy as np
-
-    from stages.io.video import video_writer
-
-    _, height, width = inverse.shape
-    sample = inverse[:, :: max(1, height // 64), :: max(1, width // 64)].astype(np.float32)
-    low, high = np.quantile(sample, [0.01, 0.99])
-    span = high - low if high > low else 1.0
-    with video_writer(file, width, height, fps) as add:
-        for frame in inverse:
-            level = np.clip((frame.astype(np.float32) - low) / span, 0, 1)
-            bgr = cv2.applyColorMap(np.rint(255 * level).astype(np.uint8), cv2.COLORMAP_TURBO)
-            add(np.ascontiguousarray(bgr[..., ::-1]))
-
-
-def _path_json(path: CameraPath, scene: "Scene", fps: int) -> dict[str, Any]:
-    """The path in the sfm frame, in a form that --render.cameras reads back."""
-    from stages.io.transforms_export import intrinsics, opengl_matrix
-
-    sfm_from_scene = scene.scene_from_sfm.inverse()
-    shared = len(set(path.cameras)) == 1
-    frames = [
-        ({} if shared else intrinsics(camera))
-        | {"file_path": f"{index:05d}", "transform_matrix": opengl_matrix(sfm_from_scene.pose(pose))}
-        for index, (camera, pose) in enumerate(zip(path.cameras, path.poses, strict=True))
-    ]
-    return (intrinsics(path.cameras[0]) if shared else {}) | {"fps": fps, "frames": frames}
-
-
-def _exposure(photo: str | None, train: Path, scene: "Scene", progress: Progress) -> "tuple[Tensor | None, str | None]":
-    """The log gain (3,) of the video, None as the field comes, and this in words, None where the field has only one.
-
-    Training is over when this is found out: a photo of which no exposure is known is no error, but what is taken
-    instead is said.
-    """
-    import torch
-
-    from stages.effects.decisions import expected_gains, neutral_in_words
-
-    field = read_json(train / "field.json")
-    neutral = neutral_in_words(field)
-    if (known := field.get("exposure")) is None:
-        if photo is not None:
-            progress.note(f"exposure is not modelled: all photos count as exposed alike, and the video like {photo}")
-        return None, None
-    if photo is None:
-        return None, neutral
-    if photo in known["photos"]:
-        return torch.tensor(known["photos"][photo]), f"exposed like {photo}"
-    if unseen := [view for view in scene.views if view.name == photo]:
-        progress.note(f"{photo} was not trained on: its exposure is what the photos taken nearest by let expect")
-        return expected_gains(field, scene, unseen)[photo], f"exposed as expected of {photo}"
-    near = difflib.get_close_matches(photo, known["photos"], n=3)
-    progress.note(f"no photo {photo} has a camera: {neutral}" + (f"; perhaps {', '.join(near)}" if near else ""))
-    return None, neutral
-
-
-def _facts(config: Config, path: CameraPath) -> dict[str, Any]:
-    camera = path.cameras[0]
-    return {
-        "path": config.path or "cameras from a file",
-        "frames": len(path.cameras),
-        "width": camera.width,
-        "height": camera.height,
-        "fps": config.fps,
-    }

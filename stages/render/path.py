@@ -5,17 +5,23 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
+import numpy as np
+import torch
+
+from nerf.geometry import camera_paths
+from nerf.geometry.camera_paths import levelled, nearest_rotations
+from nerf.geometry.near_far import near_and_far_between_views
+from nerf.geometry.rays import Rays, rays_of_view
+from nerf.geometry.scene import Camera, Scene, Similarity
 from stages.contract import StageError
+from stages.io.transforms_export import OPENGL_FROM_OPENCV
+from stages.io.transforms_files import pose_matrix, read_transforms
+from stages.render.plan import PathKind
+from stages.sfm.colmap.cameras import camera_rays, rescaled
+from stages.sfm.imported.transforms_intrinsics import intrinsics_of, read_intrinsics
 
-if TYPE_CHECKING:
-    import numpy as np
-
-    from nerf.geometry.rays import Rays
-    from nerf.geometry.scene import Camera, Scene, Similarity
-
-PathKind = Literal["orbit", "spiral", "interpolated"]
 MAX_SIDE = 2**15  # pixels: four times as many as any screen has
 MIN_FOCAL = 0.5  # in widths: a pinhole wider than 90 degrees stretches its corners
 ONE_PLACE = 1e-6  # scene units
@@ -27,8 +33,8 @@ ONE_LENS = 1.1  # between the longest and the shortest focal length of photos th
 class CameraPath:
     """One camera, all of one size, and one pose ``scene_from_camera`` (frames, 3, 4) per frame."""
 
-    cameras: "tuple[Camera, ...]"
-    poses: "np.ndarray"
+    cameras: tuple[Camera, ...]
+    poses: np.ndarray
 
     def resized(self, width: int) -> "CameraPath":
         """The same views, ``width`` pixels wide; width and height even."""
@@ -39,15 +45,8 @@ class CameraPath:
         return CameraPath(tuple(self.cameras[i] for i in frames), self.poses[list(frames)])
 
 
-def path_rays(path: CameraPath, scene: "Scene") -> "Iterator[Rays]":
+def path_rays(path: CameraPath, scene: Scene) -> Iterator[Rays]:
     """The rays (height, width) of every frame, on the CPU; near and far are those of the photos around it."""
-    import numpy as np
-    import torch
-
-    from nerf.geometry.near_far import near_and_far_between_views
-    from nerf.geometry.rays import rays_of_view
-    from stages.sfm.colmap.cameras import camera_rays
-
     views = scene.of_split("train")
     near, far = near_and_far_between_views(
         path.poses,
@@ -64,18 +63,14 @@ def path_rays(path: CameraPath, scene: "Scene") -> "Iterator[Rays]":
         yield rays_of_view(ray_directions, pose, float(near[index]), float(far[index]))
 
 
-def usual_path(scene: "Scene") -> PathKind:
+def usual_path(scene: Scene) -> PathKind:
     """Around an object an orbit, if it is known about which axis; before a scene a spiral, if the photos look where it
     looks; along the photos elsewhere, and where an orbit or a spiral would lead through what they do not show to be
     free."""
-    import numpy as np
-
-    from nerf.geometry import camera_paths
-
     poses = _poses(scene)
     near = np.array([view.near for view in scene.of_split("train")])
 
-    def clear(path: "np.ndarray") -> bool:
+    def clear(path: np.ndarray) -> bool:
         return camera_paths.keeps_clear(path, poses, near)
 
     if scene.capture_type == "around" and scene.up_known and clear(camera_paths.orbit(poses, TRIED_FRAMES)):
@@ -86,23 +81,15 @@ def usual_path(scene: "Scene") -> PathKind:
     return "interpolated"
 
 
-def _poses(scene: "Scene") -> "np.ndarray":
+def _poses(scene: Scene) -> np.ndarray:
     """Of the training photos, (n, 3, 4); set upright where they face one way: some held sideways would tilt a path."""
-    import numpy as np
-
-    from nerf.geometry.camera_paths import levelled
-
     poses = np.stack([view.scene_from_camera for view in scene.of_split("train")])
     return levelled(poses) if scene.capture_type == "forward" else poses
 
 
-def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:
+def fitted_path(scene: Scene, kind: PathKind, frames: int) -> CameraPath:
     """A path among the training photos, through an undistorted camera of median focal length or, where theirs differ,
     of one that goes along with them. Raises StageError for an orbit around photos from one place."""
-    import numpy as np
-
-    from nerf.geometry import camera_paths
-
     path_of = {
         "orbit": camera_paths.orbit,
         "spiral": camera_paths.spiral,
@@ -119,29 +106,23 @@ def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:
     return CameraPath(tuple(_pinhole(camera.width, camera.height, focal) for focal in focals), path)
 
 
-def _relative_focals(scene: "Scene") -> "np.ndarray":
+def _relative_focals(scene: Scene) -> np.ndarray:
     """Of the training photos, in longest sides."""
-    import numpy as np
-
     cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
     return np.array([camera.params[0] / max(camera.width, camera.height) for camera in cameras])
 
 
-def _pinhole(width: int, height: int, relative: float) -> "Camera":
+def _pinhole(width: int, height: int, relative: float) -> Camera:
     """With a focal length in longest sides, at most 90 degrees wide."""
-    from nerf.geometry.scene import Camera
-
     focal = max(float(relative) * max(width, height), MIN_FOCAL * width)
     return Camera("PINHOLE", width, height, (focal, focal, width / 2, height / 2))
 
 
-def median_camera(scene: "Scene") -> "Camera":
+def median_camera(scene: Scene) -> Camera:
     """The most usual photo size with the median focal length, as a pinhole with a centred principal point.
 
     Of sizes that are equally usual (each photo may have been cut by hand) it is the median in shape and in area.
     """
-    import numpy as np
-
     cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
     counts = Counter((camera.width, camera.height) for camera in cameras)
     most = max(counts.values())
@@ -151,18 +132,13 @@ def median_camera(scene: "Scene") -> "Camera":
     return _pinhole(width, height, float(np.median(_relative_focals(scene))))
 
 
-def path_from_file(scene: "Scene", file: Path) -> CameraPath:
+def path_from_file(scene: Scene, file: Path) -> CameraPath:
     """The cameras of a transforms.json (or of a path.json that this stage wrote), which lives in the sfm frame.
 
     Poses are OpenGL camera-to-world matrices; intrinsics stand at the top or in each frame, and what is missing of
     them is taken from the photos.
     Raises StageError if the file cannot be used.
     """
-    import numpy as np
-
-    from stages.io.transforms_files import read_transforms
-    from stages.sfm.imported.transforms_intrinsics import intrinsics_of, read_intrinsics
-
     content = read_transforms(file)
     usual = median_camera(scene)
     focal = usual.params[0] / max(usual.width, usual.height)
@@ -193,14 +169,8 @@ def path_from_file(scene: "Scene", file: Path) -> CameraPath:
     return CameraPath(tuple(cameras), np.stack(poses))
 
 
-def _in_scene(matrix: Any, scene_from_sfm: "Similarity") -> "np.ndarray":
+def _in_scene(matrix: Any, scene_from_sfm: Similarity) -> np.ndarray:
     """An OpenGL pose in the sfm frame as ours. Scaled axes are accepted: the nearest rotation is taken."""
-    import numpy as np
-
-    from nerf.geometry.camera_paths import nearest_rotations
-    from stages.io.transforms_export import OPENGL_FROM_OPENCV
-    from stages.io.transforms_files import pose_matrix
-
     pose = pose_matrix(matrix)
     if not np.linalg.det(pose[:, :3]) > 0:
         raise ValueError("its transform_matrix mirrors, or has no volume")
@@ -208,13 +178,11 @@ def _in_scene(matrix: Any, scene_from_sfm: "Similarity") -> "np.ndarray":
     return scene_from_sfm.pose(np.concatenate([rotation, pose[:, 3:]], axis=1))
 
 
-def even_height(width: int, camera: "Camera") -> int:
+def even_height(width: int, camera: Camera) -> int:
     """The even number of rows that keeps the camera's proportions best."""
     return max(2, 2 * round(width * camera.height / camera.width / 2))
 
 
-def resized(camera: "Camera", width: int) -> "Camera":
+def resized(camera: Camera, width: int) -> Camera:
     """The same view with another (even) width and the even height next to its proportions."""
-    from stages.sfm.colmap.cameras import rescaled
-
     return rescaled(camera, width, even_height(width, camera))

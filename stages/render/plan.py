@@ -1,10 +1,12 @@
-"""How large and how long a video may be so that drawing it stays within a number of rays."""
+"""The kinds of paths; how large and how long a video may be so that rendering it stays within a number of rays."""
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Camera
+
+PathKind = Literal["orbit", "spiral", "interpolated"]
 
 MAX_FRAMES, MIN_FRAMES, MIN_SLIDES = 120, 24, 6  # four smooth seconds, a turn in steps of 15°, a slide show
 MAX_SIDE, USUAL_SIDE, SMALL_SIDE, MIN_SIDE = 1920, 480, 200, 32  # pixels

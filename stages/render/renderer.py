@@ -5,17 +5,20 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import torch
+from torch import Tensor
+
+from nerf.effects.appearance import AppearanceModel
+from nerf.effects.exposure import ExposureModel
+from nerf.fields.interface import RadianceModel, Rendering
+from nerf.geometry.rays import Rays
+from nerf.rendering.images import render_image
 from stages.amounts import duration
 from stages.contract import Progress
+from stages.hardware.device import compute_device
+from stages.io.field_files import load_field
 from stages.io.files import read_json
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from nerf.fields.interface import RadianceModel, Rendering
-    from nerf.geometry.rays import Rays
 
 SHARE = 0.3  # of the training's seconds that drawing may be expected to take; what is left is room for a busier machine
 MIN_DRAWING = 0.5  # seconds: less draws nothing
@@ -28,29 +31,23 @@ FIRST_SIDE = 24  # pixels
 class Renderer:
     """A trained field, where it is computed, and what it is shown over."""
 
-    model: "RadianceModel"
-    background: "Tensor"  # (3,), on the model's device
+    model: RadianceModel
+    background: Tensor  # (3,), on the model's device
 
-    def at_gain(self, log_gain: "Tensor") -> "Renderer":
+    def at_gain(self, log_gain: Tensor) -> "Renderer":
         """This field at another gain than the neutral one; only for a field that models exposure."""
-        from nerf.effects.appearance import AppearanceModel
-        from nerf.effects.exposure import ExposureModel
-
         assert isinstance(self.model, AppearanceModel)
         effects = (ExposureModel(log_gain[None].to(self.background.device)),)
         return replace(self, model=AppearanceModel(self.model.model, effects))
 
-    def draw(self, rays: "Rays", on_chunk: Callable[[float], None] | None = None) -> "Rendering":
+    def draw(self, rays: Rays, on_chunk: Callable[[float], None] | None = None) -> Rendering:
         """The picture (height, width) that ``rays`` see, on the CPU. ``on_chunk`` is told the finished share."""
-        from nerf.fields.interface import Rendering
-        from nerf.rendering.images import render_image
-
         device = self.background.device
         on_device = rays.each(lambda part: part.to(device))
         image = render_image(self.model, on_device, self.background, on_chunk=on_chunk)
         return Rendering(*(part.cpu() for part in image))
 
-    def rays_per_second(self, sample: "Callable[[int], Rays]", largest: int, seconds: float) -> float:
+    def rays_per_second(self, sample: Callable[[int], Rays], largest: int, seconds: float) -> float:
         """Measured speed. ``sample(side)`` are rays of the pictures to come, reduced to ``side`` pixels; the side
         grows from FIRST_SIDE to ``largest`` until drawing takes ``seconds``."""
         side = min(FIRST_SIDE, largest)
@@ -71,11 +68,6 @@ def load_renderer(
     """The field that stage train left in ``train``, over ``background``, which a field with a sky does not show; None:
     what it was trained to stand before. One that models exposure is shown at its neutral one. ``progress`` is told
     where the field is computed by torch's kernels alone."""
-    import torch
-
-    from stages.hardware.device import compute_device
-    from stages.io.field_files import load_field
-
     device = compute_device()
     model, info = load_field(train, device, progress)
     return Renderer(model, torch.tensor(info["background"] if background is None else background, device=device))
@@ -107,7 +99,7 @@ def trained_seconds(train: Path) -> float:
     return read_json(train / "curve.json")["points"][-1]["seconds"]
 
 
-def measured_speed(train: Path, sample: "Callable[[int], Rays]", largest: int) -> float:
+def measured_speed(train: Path, sample: Callable[[int], Rays], largest: int) -> float:
     """Rays per second that the field in ``train`` draws on this machine, found in no more than a second or two."""
     seconds = min(TIMED_SECONDS, TIMED_SHARE * trained_seconds(train))
     return load_renderer(train).rays_per_second(sample, largest, seconds)

@@ -227,8 +227,6 @@ def _camera_groups(results: Results, names: Mapping[str, str]) -> list[dict[str,
 
 def _thumbnail(path: Path) -> str | None:
     """A small picture of a photo, None where it is not there."""
-    import numpy as np
-
     if not path.exists():
         return None
     with pillow().open(path) as picture:
@@ -327,8 +325,6 @@ def _pictures(results: Results, image: dict[str, Any], width: int) -> dict[str, 
 
 def _opaque(pixels: np.ndarray, background: int) -> np.ndarray:
     """(H, W, 3) uint8 from (H, W, 3 or 4): transparent photos over a grey level, as they were scored."""
-    import numpy as np
-
     if pixels.shape[2] == 3:
         return pixels
     alpha = pixels[..., 3:] / 255

@@ -1,21 +1,24 @@
 """The report's plots as inline SVG: text and axes take the page's colour, and equal data is equal bytes."""
 
+import math
 import re
 from collections.abc import Sequence
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.patches import Rectangle
 
 from nerf import REGION_HALF
+from nerf.geometry.scene import Scene, View
+from nerf.training.learning_curve import Gain, knee, quality_at
 from stages.amounts import duration
 from stages.io.figures import INK, svg_element, svg_figure
+from stages.sfm.pairs.match_graph import natural_order
 from stages.train.curve import heldout_curve
-
-if TYPE_CHECKING:
-    import numpy as np
-    from matplotlib.axes import Axes
-
-    from nerf.geometry.scene import Scene, View
-    from nerf.training.learning_curve import Gain
 
 BLUE, ORANGE, GREY = "#3b82f6", "#f2711c", "#8a8f98"
 ORDER_COLOURS = (BLUE, "#9b5de5", "#e0457b", ORANGE, "#e0a800")  # from first to last, legible on light and dark pages
@@ -25,7 +28,7 @@ ROOM_BELOW = 0.08  # of the curve's height, so that the name of the lowest line 
 
 
 def curve_svg(
-    points: Sequence[dict[str, Any]], baselines: dict[str, float | None], coming: "Gain | None" = None
+    points: Sequence[dict[str, Any]], baselines: dict[str, float | None], coming: Gain | None = None
 ) -> str | None:
     """PSNR against training seconds, one grid line per doubling of the time, with the knee and what is ``coming``, what
     the next doubling is predicted to buy; None for fewer than two points. ``baselines`` are drawn as horizontal lines
@@ -52,22 +55,20 @@ def curve_svg(
         return svg_element(figure)
 
 
-def _draw_prediction(axes: "Axes", rows: Sequence[dict[str, Any]], coming: "Gain") -> None:
+def _draw_prediction(axes: Axes, rows: Sequence[dict[str, Any]], coming: Gain) -> None:
     """A dotted line on to twice the time, with its interval."""
     (seconds, psnr), style = heldout_curve(rows)[-1], {"color": BLUE, "lw": 1.5, "ls": (0, (1, 1.5))}
     axes.plot([seconds, 2 * seconds], [psnr, psnr + coming.db], label="predicted", **style)
     axes.errorbar(2 * seconds, psnr + coming.db, coming.half_width, color=BLUE, capsize=4, lw=1.5)
 
 
-def _draw_knee(axes: "Axes", curve: Sequence[tuple[float, float]]) -> None:
-    from nerf.training.learning_curve import knee, quality_at
-
+def _draw_knee(axes: Axes, curve: Sequence[tuple[float, float]]) -> None:
     if (seconds := knee(curve)) is not None:
         ring = {"color": "none", "mec": ORANGE, "ms": 11, "mew": 2}
         axes.plot(seconds, quality_at(curve, seconds), "o", label=f"knee, {duration(seconds)}", **ring)
 
 
-def _draw_baselines(axes: "Axes", baselines: dict[str, float]) -> None:
+def _draw_baselines(axes: Axes, baselines: dict[str, float]) -> None:
     """Horizontal lines named beside the plot, the highest above its line and the others below, so as not to collide."""
     for name, psnr in baselines.items():
         above = psnr == max(baselines.values())
@@ -78,16 +79,12 @@ def _draw_baselines(axes: "Axes", baselines: dict[str, float]) -> None:
     axes.set_ylim(low - ROOM_BELOW * (high - low), high)
 
 
-def camera_svgs(
-    scene: "Scene", views: "Sequence[View]", xyz: "np.ndarray", rgb: "np.ndarray", joined: bool
-) -> dict[str, str]:
+def camera_svgs(scene: Scene, views: Sequence[View], xyz: np.ndarray, rgb: np.ndarray, joined: bool) -> dict[str, str]:
     """Some ``views`` of the scene, coloured in the order of their names and ``joined`` in it or not, the sparse points
     (n, 3) in their colours and the region of interest, by the name of the projection.
 
     Orthographic projections along z and along y: from above and from the side where the scene knows its up.
     """
-    from stages.sfm.pairs.match_graph import natural_order
-
     ordered = [views[i] for i in natural_order([view.name for view in views])]
     names = ("from above", "from the side") if scene.up_known else ("along z", "along y")
     return {
@@ -98,16 +95,13 @@ def camera_svgs(
 
 def _layout_svg(
     name: str,
-    scene: "Scene",
-    views: "Sequence[View]",
+    scene: Scene,
+    views: Sequence[View],
     plane: tuple[int, int],
-    points: "tuple[np.ndarray, np.ndarray]",
+    points: tuple[np.ndarray, np.ndarray],
     joined: bool,
 ) -> str:
     """One projection, on the two given axes of the scene. Points beyond the cameras and the box are cut off."""
-    import numpy as np
-    from matplotlib.patches import Rectangle
-
     centres = np.array([view.scene_from_camera[:, 3] for view in views])[:, plane]
     low, high = np.minimum(centres.min(0), -REGION_HALF), np.maximum(centres.max(0), REGION_HALF)
     middle, half = (low + high) / 2, (high - low) / 2 + 0.06 * (high - low).max()
@@ -128,14 +122,10 @@ def _layout_svg(
 
 
 def _draw_cameras(
-    axes: "Axes", scene: "Scene", views: "Sequence[View]", plane: tuple[int, int], depth: float, joined: bool
+    axes: Axes, scene: Scene, views: Sequence[View], plane: tuple[int, int], depth: float, joined: bool
 ) -> None:
     """Outlines coloured from the first view to the last, test photos with a dot, and thin lines from each view to the
     next in the same folder: a jump between photos that follow each other is seen at once."""
-    import numpy as np
-    from matplotlib.collections import LineCollection
-    from matplotlib.colors import LinearSegmentedColormap
-
     colours = LinearSegmentedColormap.from_list("order", ORDER_COLOURS)(np.linspace(0, 1, len(views)))
     centres = np.array([view.scene_from_camera[:, 3] for view in views])[:, plane]
     folders = [PurePosixPath(view.name).parent for view in views]
@@ -148,10 +138,8 @@ def _draw_cameras(
     axes.scatter(*centres[test].T, c=colours[test], s=20, lw=0, zorder=4)
 
 
-def _outline(scene: "Scene", view: "View", depth: float) -> "np.ndarray":
+def _outline(scene: Scene, view: View, depth: float) -> np.ndarray:
     """The pyramid from the camera's centre to its image at ``depth``, as one line through all edges: (11, 3)."""
-    import numpy as np
-
     camera = scene.cameras[view.camera]
     # COLMAP lists the focal length first in every camera model.
     x, y = (np.array([camera.width, camera.height]) / 2 / camera.params[0]) * depth
@@ -160,10 +148,8 @@ def _outline(scene: "Scene", view: "View", depth: float) -> "np.ndarray":
     return stroke @ view.scene_from_camera[:, :3].T + view.scene_from_camera[:, 3]
 
 
-def _doubling_axis(axes: "Axes", first: float, last: float, end: float) -> None:
+def _doubling_axis(axes: Axes, first: float, last: float, end: float) -> None:
     """A logarithmic time axis to ``end`` with ticks there, at ``last`` and at its halves, and the last half shaded."""
-    import math
-
     ticks = [last / 2**k for k in range(max(1, min(8, math.ceil(math.log2(last / first)) + 1)))]
     ticks = [end, *ticks] if end > last else ticks
     axes.set_xscale("log", base=2)

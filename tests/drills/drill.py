@@ -9,11 +9,15 @@ import multiprocessing
 import os
 import shutil
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from pipeline.cli.commands import run_command
+from pipeline.engine import manifests
 
 MARK = "PIPELINE_DRILL"  # in the environment of a program and of all that it starts
 TINY = (
@@ -112,8 +116,6 @@ class Program:
 
 def _live(words: list[str], files: Path, mark: str, prepare: Prepare) -> None:
     """In the forked process: become a program as a shell starts it, and run the command line."""
-    import sys
-
     os.setsid()
     for name, number in (("out", 1), ("err", 2)):
         descriptor = os.open(files / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
@@ -124,8 +126,6 @@ def _live(words: list[str], files: Path, mark: str, prepare: Prepare) -> None:
     os.environ[MARK] = mark
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    from pipeline.cli.commands import run_command
-
     if prepare is not None:
         prepare()
     sys.exit(run_command(words))
@@ -145,8 +145,6 @@ def finished_folders(workspace: Path) -> dict[str, Path]:
 
 def results(workspace: Path) -> dict[str, str]:
     """Stage → digest of its outputs, the files read anew. The report shows how long everything took: it is left out."""
-    from pipeline.engine import manifests
-
     found = {}
     for stage, folder in finished_folders(workspace).items():
         manifest = manifests.read(folder)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.engine.keys import ContentIndex
 from tests.drills.campaigns import Chain
 from tests.drills.drill import finished_folders, results
 
@@ -57,8 +58,6 @@ def test_a_clock_that_jumps(chain: Chain, tmp_path: Path, jump: float, reads: in
 
 
 def test_photos_exchanged_under_their_old_size_and_date(chain: Chain, tmp_path: Path):
-    from pipeline.engine.keys import ContentIndex
-
     shutil.copytree(chain.photos, tmp_path / "photos")
     photo = tmp_path / "photos/train/r_0.png"
     index = ContentIndex(tmp_path / "index")

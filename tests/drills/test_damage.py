@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.engine import manifests
+from pipeline.engine.manifests import BadManifest
 from tests.drills.campaigns import Chain
 from tests.drills.drill import Program, copy_workspace, finished_folders, results
 
@@ -38,9 +40,6 @@ def status(workspace: Path, *more: str) -> tuple[int, str]:
 
 def test_a_flipped_bit_in_any_file_is_found(chain: Chain, tmp_path: Path):
     # Every file of every stage in turn, manifests and records included.
-    from pipeline.engine import manifests
-    from pipeline.engine.manifests import BadManifest
-
     workspace = copy_workspace(chain.workspace, tmp_path / "w.nerf")
     count = 0
     for folder in finished_folders(workspace).values():

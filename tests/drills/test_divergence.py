@@ -24,6 +24,8 @@ from stages.io.field_files import load_field
 from stages.io.files import read_scene
 from stages.train import loop
 from stages.train.data import training_dataset
+from stages.train.fields.field_list import make_trainer, with_defaults
+from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.health_check import symptom_of
 from tests.refusals import refused
 from tests.stages.photo_scene import photographed
@@ -230,9 +232,6 @@ def test_no_number_is_a_symptom(inputs: dict[str, Path], progress: Any) -> None:
 
 
 def train_loop_trainer(inputs: dict[str, Path], dataset: RayDataset) -> HashGridTrainer:
-    from stages.train.fields.field_list import make_trainer, with_defaults
-    from stages.train.fields.hash_grid_options import HashGridOptions
-
     asked = train.Config(downscale=1.0, steps=1, grid=HashGridOptions(**GRID, micro_batches=1, backend="torch"))
     config = with_defaults(asked.model_copy(update={"contracted": False, "view_dependence": True}))
     trainer = make_trainer(config, read_scene(inputs["normalise"]), dataset, 0)

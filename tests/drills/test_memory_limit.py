@@ -4,6 +4,7 @@ import resource
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
 import pytest
 
 from pipeline.engine.stage_list import STAGES
@@ -18,8 +19,6 @@ class LimitedTo:
     more: int
 
     def __call__(self) -> None:
-        import psutil
-
         taken = psutil.Process().memory_info().data
         resource.setrlimit(resource.RLIMIT_DATA, (taken + self.more, taken + self.more))
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import torch
 
 from tests.drills.campaigns import Chain
 from tests.drills.drill import Program, results, run_words
@@ -21,8 +22,6 @@ class Threads:
     count: int
 
     def __call__(self) -> None:
-        import torch
-
         torch.set_num_threads(self.count)
         if self.count == 1 and hasattr(os, "sched_setaffinity"):
             os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})

@@ -7,9 +7,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 from hypothesis import strategies as st
 
+from nerf.geometry.normalisation import normalise
+from nerf.geometry.scene import Camera, Scene, Similarity, View
+from nerf.synthetic.scenes import ring_of_cameras
 from stages.contract import StageError
+from stages.ingest.sources import find_source
+from stages.io.photos import Photo, write_photos
+from stages.io.sparse_model import SparseImage, SparseModel
+from stages.normalise.scene_frame import _reconstruction
+from stages.render.path import path_from_file, path_rays
+from stages.sfm.colmap.cameras import project
+from stages.sfm.colmap.models import read_model, write_model
+from stages.sfm.imported.conventions import AS_DECLARED
+from stages.sfm.imported.import_poses import write_imported_model
 from tests.fuzz.inputs import H, W, json_files
 from tests.synthetic_photos import Quiet
 
@@ -17,8 +30,6 @@ from tests.synthetic_photos import Quiet
 @cache
 def transforms() -> dict[str, Any]:
     """A valid transforms file of four photos."""
-    from nerf.synthetic.scenes import ring_of_cameras
-
     frames = [
         {
             "file_path": f"p{index}.png",
@@ -31,8 +42,6 @@ def transforms() -> dict[str, Any]:
 
 
 def photos_of(frames: dict[str, str]) -> list:
-    from stages.io.photos import Photo
-
     return [
         Photo(name, f"images/{i}.png", W, H, 0, None, None, False, 1.0)
         for i, name in enumerate(sorted(set(frames.values())))
@@ -41,9 +50,6 @@ def photos_of(frames: dict[str, str]) -> list:
 
 def _load_cameras(given: Path, folder: Path) -> None:
     """From what is given to the finished stages ingest (photos.json) and sfm, less the photos."""
-    from stages.ingest.sources import find_source
-    from stages.io.photos import write_photos
-
     for name in (frame["file_path"] for frame in transforms()["frames"]):
         (folder.parent / name).touch()
     source = find_source(given)
@@ -57,12 +63,6 @@ def _load_cameras(given: Path, folder: Path) -> None:
 
 def _import_cameras(cameras: Path, photos: list, folder: Path) -> None:
     """The end of stage sfm with given cameras, and the scene frame of them: finite, whatever they were."""
-    from nerf.geometry.normalisation import normalise
-    from stages.normalise.scene_frame import _reconstruction
-    from stages.sfm.colmap.models import read_model
-    from stages.sfm.imported.conventions import AS_DECLARED
-    from stages.sfm.imported.import_poses import write_imported_model
-
     write_imported_model(cameras, AS_DECLARED, photos, folder, folder / "sfm", Quiet())
     model = read_model(folder / "sfm" / "sparse")
     try:
@@ -84,9 +84,6 @@ def try_transforms(folder: Path) -> None:
 @cache
 def scene() -> Any:
     """A valid scene.json."""
-    from nerf.geometry.scene import Camera, Scene, Similarity, View
-    from nerf.synthetic.scenes import ring_of_cameras
-
     views = tuple(
         View(f"{i}.png", f"images/{i}.png", 0, pose, 0.1, 9.0, "train", None)
         for i, pose in enumerate(ring_of_cameras(4))
@@ -96,8 +93,6 @@ def scene() -> Any:
 
 
 def try_path(folder: Path) -> None:
-    from stages.render.path import path_from_file, path_rays
-
     path = path_from_file(scene(), folder / "path.json").resized(8)
     rays = next(path_rays(path, scene()))
     assert bool(rays.directions.isfinite().all()) and bool(rays.origins.isfinite().all())
@@ -106,14 +101,6 @@ def try_path(folder: Path) -> None:
 @cache
 def colmap_models() -> dict[str, dict[str, bytes]]:
     """A valid COLMAP model as binary and as text files."""
-    import pycolmap
-
-    from nerf.geometry.scene import Camera
-    from nerf.synthetic.scenes import ring_of_cameras
-    from stages.io.sparse_model import SparseImage, SparseModel
-    from stages.sfm.colmap.cameras import project
-    from stages.sfm.colmap.models import write_model
-
     camera, points = Camera("OPENCV", W, H, (30.0, 31.0, 12.0, 10.0, 0.01, 0.0, 0.0, 0.0)), np.eye(3) / 4
     poses = ring_of_cameras(3)
     xy = [project(camera, (points - pose[:, 3]) @ pose[:, :3]) for pose in poses]
@@ -131,8 +118,6 @@ def colmap_models() -> dict[str, dict[str, bytes]]:
 
 
 def try_colmap(folder: Path) -> None:
-    from stages.io.photos import write_photos
-
     photos = photos_of({f"p{i}.png": f"p{i}.png" for i in range(3)})
     (folder / "out").mkdir()
     write_photos(folder / "out", photos, [], {})

@@ -8,7 +8,14 @@ from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
+from PIL import Image
 
+from stages.ingest.decoding import decode
+from stages.ingest.masks import read_mask
+from stages.ingest.near_duplicates import thumbnail
+from stages.ingest.sharpness import one_colour, sharpness
+from stages.ingest.video_frames import take_frames
+from stages.io.video import video_writer
 from tests.fuzz.inputs import H, W, damaged
 from tests.synthetic_photos import Quiet
 
@@ -16,8 +23,6 @@ from tests.synthetic_photos import Quiet
 @cache
 def pictures() -> dict[str, bytes]:
     """One valid picture of every format and of most modes."""
-    from PIL import Image
-
     x, y = np.meshgrid(np.linspace(0, 1, W), np.linspace(0, 1, H))
     rgb = np.rint(255 * np.stack([x, y, x * y], -1)).astype(np.uint8)
     image = Image.fromarray(rgb)
@@ -68,10 +73,6 @@ def any_picture() -> st.SearchStrategy[bytes]:
 
 
 def try_photo(folder: Path) -> None:
-    from stages.ingest.decoding import decode
-    from stages.ingest.near_duplicates import thumbnail
-    from stages.ingest.sharpness import one_colour, sharpness
-
     decoded = decode(folder / "a.png")
     assert decoded.pixels.dtype == np.uint8 and decoded.pixels.shape[2] in (3, 4)
     for measure in (sharpness, one_colour, thumbnail):
@@ -79,8 +80,6 @@ def try_photo(folder: Path) -> None:
 
 
 def try_mask(folder: Path) -> None:
-    from stages.ingest.masks import read_mask
-
     mask = read_mask(folder / "a.png", H, W, 6).pixels
     assert mask.shape == (W, H) and set(np.unique(mask)) <= {0, 255}
 
@@ -88,8 +87,6 @@ def try_mask(folder: Path) -> None:
 @cache
 def clip() -> bytes:
     """A short video whose picture moves."""
-    from stages.io.video import video_writer
-
     noise = np.random.default_rng(0).integers(0, 256, (48, 160, 3), np.uint8).repeat(2, 0).repeat(2, 1)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.mp4"
@@ -100,7 +97,5 @@ def clip() -> bytes:
 
 
 def try_video(folder: Path) -> None:
-    from stages.ingest.video_frames import take_frames
-
     (folder / "out").mkdir()
     assert len(take_frames(folder / "a.mp4", 5, folder / "out", Quiet())) >= 3

@@ -4,14 +4,28 @@ import contextlib
 import hashlib
 import json
 import tempfile
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from hypothesis import strategies as st
+from safetensors.numpy import save
 
+from nerf.fields.vanilla import VanillaNerf, VanillaSettings
+from pipeline.cli.commands import _reader
+from pipeline.cli.settings import read_toml, settings_from
+from pipeline.engine import manifests, status
+from pipeline.engine.manifests import Manifest, outputs_digest, sealed
+from pipeline.engine.run_file import VERSION
+from pipeline.engine.settings import Settings
 from stages.contract import StageError
+from stages.io.field_files import load_field, save_field
+from stages.io.files import read_scene, read_tensors
+from stages.io.photos import read_frame_names, read_photos, write_photos
+from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from tests.fuzz.cameras import photos_of
 from tests.fuzz.inputs import json_files, one_of
 
@@ -29,15 +43,10 @@ formats = ["ply", "glb"]
 
 
 def try_toml(folder: Path) -> None:
-    from pipeline.cli.settings import read_toml, settings_from
-
     settings_from(read_toml(folder / "a.toml"), "--config a.toml")
 
 
 def try_run(folder: Path) -> None:
-    from pipeline.cli.commands import _reader
-    from pipeline.engine import status
-
     with contextlib.chdir(folder):  # where relative paths in it lead
         status.all_statuses(*_reader(folder), deep=False)
 
@@ -45,9 +54,6 @@ def try_run(folder: Path) -> None:
 @cache
 def run_file() -> dict[str, Any]:
     """A valid run.json."""
-    from pipeline.engine.run_file import VERSION
-    from pipeline.engine.settings import Settings
-
     options = Settings().model_dump(mode="json")
     keys = dict.fromkeys(options, "0" * 64)
     return {
@@ -62,10 +68,6 @@ def run_file() -> dict[str, Any]:
 @cache
 def manifest() -> dict[str, Any]:
     """A valid manifest.json of one output."""
-    from dataclasses import asdict
-
-    from pipeline.engine.manifests import Manifest, outputs_digest
-
     outputs = {"a.json": {"size": 2, "sha256": hashlib.sha256(b"{}").hexdigest()}}
     digest = outputs_digest(outputs)
     return asdict(Manifest("mesh", 1, "0" * 64, {}, {}, outputs, digest, {}, {}, "line", 1.0, "2026", {}))
@@ -73,8 +75,6 @@ def manifest() -> dict[str, Any]:
 
 def with_seal(text: bytes) -> bytes:
     """An object with the seal that it would have: what is behind the seal is to be read, too."""
-    from pipeline.engine.manifests import sealed
-
     try:
         value = json.loads(text)
         return json.dumps(sealed(value)).encode() if isinstance(value, dict) else text
@@ -83,14 +83,10 @@ def with_seal(text: bytes) -> bytes:
 
 
 def try_manifest(folder: Path) -> None:
-    from pipeline.engine import manifests
-
     manifests.check_outputs(folder, manifests.read(folder), deep=True)
 
 
 def try_photos(folder: Path) -> None:
-    from stages.io.photos import read_frame_names, read_photos
-
     for photo in read_photos(folder):
         assert not Path(photo.file).is_absolute() and ".." not in Path(photo.file).parts
     read_frame_names(folder)
@@ -99,39 +95,28 @@ def try_photos(folder: Path) -> None:
 @cache
 def photos_file() -> bytes:
     """A valid photos.json."""
-    from stages.io.photos import write_photos
-
     with tempfile.TemporaryDirectory() as folder:
         write_photos(Path(folder), photos_of({"a": "p0.png", "b": "p1.png"}), [], {"a": "p0.png"})
         return (Path(folder) / "photos.json").read_bytes()
 
 
 def try_scene(folder: Path) -> None:
-    from stages.io.files import read_scene
-
     read_scene(folder)
 
 
 def try_points(folder: Path) -> None:
-    from stages.io.files import read_tensors
-
     read_tensors(folder / "points.safetensors")
 
 
 @cache
 def points() -> bytes:
     """A valid points.safetensors."""
-    from safetensors.numpy import save
-
     return save({"xyz": np.zeros((3, 3), np.float32), "rgb": np.zeros((3, 3), np.uint8), "view": np.arange(3)})
 
 
 @cache
 def field() -> dict[str, bytes]:
     """A valid, tiny trained field."""
-    from nerf.fields.vanilla import VanillaNerf, VanillaSettings
-    from stages.io.field_files import save_field
-
     model = VanillaNerf(VanillaSettings(depth=2, width=8, position_frequencies=2, direction_frequencies=1), seed=0)
     exposure = {"neutral": [0.0, 0.0, 0.0], "photos": {"p0.png": [0.1, 0.0, 0.0]}}
     info = {"background": [1, 1, 1], "downscale": 1.0, "steps": 5, "rays": 50, "exposure": exposure}
@@ -147,25 +132,17 @@ def fields() -> st.SearchStrategy[dict[str, bytes]]:
 
 
 def try_field(folder: Path) -> None:
-    from stages.io.field_files import load_field
-
     load_field(folder)
 
 
 @cache
 def checkpoint() -> dict[str, bytes]:
     """A valid checkpoint."""
-    import torch
-
-    from stages.train.checkpoints import Checkpoint, save_checkpoint
-
     with tempfile.TemporaryDirectory() as folder:
         save_checkpoint(Path(folder), Checkpoint(7, {"w": torch.zeros(3)}, {"lr": 0.1}))
         return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
 
 
 def try_checkpoint(folder: Path) -> None:
-    from stages.train.checkpoints import latest_checkpoint
-
     if latest_checkpoint(folder, lambda _: None) is None:
         raise StageError("train.no-state", "no checkpoint", "the only one is damaged", "-")

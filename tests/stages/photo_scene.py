@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages.effects.decisions import Decisions, write_decisions
@@ -34,8 +35,6 @@ def photographed(
     folder: Path, views: int = 8, channels: int = 3, bounded: bool = True, mask: np.ndarray | None = None
 ) -> tuple[dict[str, Path], Scene]:
     """Write photos, scene.json and a ``mask`` (0 ignore, 255 use) for all; every fourth view is a test view."""
-    from PIL import Image
-
     inputs = {name: folder / name for name in ("ingest", "normalise", "effects")}
     (inputs["ingest"] / "images").mkdir(parents=True)
     inputs["normalise"].mkdir()

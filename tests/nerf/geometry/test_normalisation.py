@@ -1,4 +1,5 @@
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -358,8 +359,6 @@ def test_photos_from_one_place_without_points_have_no_scale() -> None:
 
 
 def test_lego_fills_the_region_and_stays_inside(shared_data) -> None:
-    import json
-
     axes = np.diag([1.0, -1.0, -1.0])
     frames = []
     for part in ("train", "test"):

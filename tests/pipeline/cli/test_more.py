@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from nerf.training.hash_grid_trainer import HashGridTrainer
 from pipeline.cli.commands import run_command
 from tests.small_scenes import write_blender_scene
 
@@ -65,8 +66,6 @@ def test_more_has_a_folder_of_its_own_and_a_chain_of_them(trained, monkeypatch: 
 
 
 def test_an_interrupted_more_is_taken_up_by_the_same_words(trained, monkeypatch: pytest.MonkeyPatch):
-    from nerf.training.hash_grid_trainer import HashGridTrainer
-
     photos, workspace = trained
     words = ["run", photos, "-o", workspace, "--until", "train", "--more", "9steps"]
     assert run_command(["train", workspace, "--train.steps", "12"]) == 0

@@ -15,7 +15,7 @@ from pipeline.engine.job import NotReady
 from pipeline.engine.runner import Runner
 from pipeline.engine.workspace import Workspace
 from stages.contract import StageError
-from stages.ingest import sources
+from stages.ingest.sources import find_source
 from tests.pipeline.engine import fake_stages
 from tests.pipeline.engine.fake_stages import FakeSettings, calls
 from tests.refusals import refused
@@ -91,8 +91,8 @@ def test_photos_are_listed_once(bring: Bring, tmp_path: Path, known: bool, monke
     if not known:
         Image.new("RGB", (4, 4), (9, 9, 9)).save(tmp_path / "photos/new.png")
     workspace, runner = reader(tmp_path / "w.nerf")
-    found, listed = sources.find_source, []
-    monkeypatch.setattr(sources, "find_source", lambda *given: listed.append(given) or found(*given))
+    found, listed = find_source, []
+    monkeypatch.setattr("pipeline.engine.runner.find_source", lambda *given: listed.append(given) or found(*given))
     with workspace:
         assert [runner.found(stage) is not None for stage in ALL] == [known] * 3
         runner.run(ALL)

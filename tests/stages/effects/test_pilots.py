@@ -13,6 +13,7 @@ from stages.effects import pilots
 from stages.effects.decisions import Decisions, expected_gains, told_by_neighbours
 from stages.effects.pilots import Pilot, PilotScene, pilot_scene, run_pilot
 from stages.io.files import read_scene
+from stages.io.pixels import load_pixels
 from tests.effect_scenes import Effects, effect_scene
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 from tests.synthetic_photos import Quiet
@@ -170,8 +171,6 @@ def test_the_scenes_photos_are_as_bright_as_they_say(tmp_path: Path) -> None:
     """The helper itself: an exposure effect changes photos by gains within its range, and nothing else does."""
     plain = effect_scene(tmp_path / "plain", Effects(), views=3)
     exposed = effect_scene(tmp_path / "exposed", Effects(exposure_ev=1.0), views=3)
-    from stages.io.pixels import load_pixels
-
     for name in ("000.png", "001.png", "002.png"):
         a, b = (torch.tensor(load_pixels(i["ingest"] / "images" / name, 240, 180)) / 255 for i in (plain, exposed))
         middle = (a > 0.1) & (a < 0.6)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -10,7 +11,7 @@ from PIL import Image
 import stages.effects.track_colours
 from nerf.effects.statistics import transients
 from nerf.effects.statistics.exposure import EV, fit_exposure
-from nerf.geometry.scene import Camera, Scene, View
+from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages.effects.evidence import training_residuals
 from stages.effects.study import scene_evidence
 from stages.effects.track_colours import (
@@ -20,6 +21,7 @@ from stages.effects.track_colours import (
     MOST,
     _expected,
     _window_means,
+    _windows,
     look_at_photos,
     training_tracks,
 )
@@ -83,8 +85,6 @@ def photographed_points(
 
 
 def _scene(views: list[View]) -> Scene:
-    from nerf.geometry.scene import Similarity
-
     return Scene((CAMERA,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), False, False, "around", True)
 
 
@@ -206,8 +206,6 @@ def test_fewer_observations_are_whole_tracks(tmp_path: Path, progress: SilentPro
 
 
 def test_near_photos_have_larger_windows(tmp_path: Path, progress: SilentProgress) -> None:
-    from stages.effects.track_colours import _windows
-
     scene, points = photographed_points(tmp_path)
     tracks = training_tracks(scene, points, MOST)[0]
     near = replace(tracks, footprint=np.where(tracks.view == 0, 0.5, 1.0) * 0.03)
@@ -268,8 +266,6 @@ def test_without_points_only_the_photos_are_looked_at(tmp_path: Path, progress: 
 
 
 def test_gradients_are_thinned_by_a_smear_across_it_alone(tmp_path: Path, progress: SilentProgress) -> None:
-    import cv2
-
     scene, points = photographed_points(tmp_path)
     sharp = look_at_photos(tmp_path, scene, without_points(points), progress).gradients[0]
     with Image.open(tmp_path / "images/1.png") as image:

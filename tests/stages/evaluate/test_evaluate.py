@@ -101,8 +101,8 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
         write_json(inputs["train"] / "field.json", info)
         write_json(inputs["train"] / "curve.json", {"points": [{"seconds": 2.0}]})
         monkeypatch.setattr("stages.render.renderer.Renderer.rays_per_second", lambda *_: speed)
-        monkeypatch.setattr("stages.hardware.device.compute_device", lambda: "cpu")
-        monkeypatch.setattr("stages.io.field_files.load_field", lambda *_: (field or SkyField(), info))
+        monkeypatch.setattr("stages.render.renderer.compute_device", lambda: "cpu")
+        monkeypatch.setattr("stages.render.renderer.load_field", lambda *_: (field or SkyField(), info))
         return inputs
 
     return build

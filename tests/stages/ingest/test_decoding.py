@@ -5,7 +5,9 @@ import struct
 import zlib
 from pathlib import Path
 
+import cv2
 import numpy as np
+import pillow_heif
 import pytest
 from PIL import Image, ImageCms
 
@@ -67,8 +69,6 @@ def test_sixteen_bit_colour_becomes_eight_and_is_not_copied(tmp_path: Path) -> N
 
 def test_sixteen_bit_colour_tiffs_and_alpha(tmp_path: Path) -> None:
     """Written by OpenCV: Pillow cannot write them."""
-    import cv2
-
     deep = smooth().astype(np.uint16) * 257
     cv2.imwrite(str(tmp_path / "a.tif"), np.ascontiguousarray(deep[..., ::-1]))
     assert np.array_equal(decode(tmp_path / "a.tif").pixels, smooth())
@@ -150,8 +150,6 @@ def test_a_broken_profile_is_said_and_ignored(tmp_path: Path) -> None:
 
 
 def test_heic(tmp_path: Path) -> None:
-    import pillow_heif
-
     path = tmp_path / "a.heic"
     big = smooth(96, 64)
     try:

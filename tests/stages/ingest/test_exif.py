@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import ExifTags, Image
 
@@ -150,8 +151,6 @@ def test_altitudes_stand_for_themselves() -> None:
 
 @pytest.mark.parametrize("scene", ["banana", "sceaux_castle", "fern", "fox"])
 def test_focal_prior_agrees_with_colmap(shared_data: Path, scene: str) -> None:
-    import pycolmap
-
     photo = min((shared_data / scene / "images").iterdir())
     camera = pycolmap.infer_camera_from_image(photo)
     focal = decode(photo).camera_key.focal_px

@@ -1,6 +1,7 @@
 """From whatever lies in the folder to decoded photos with ASCII names, and words for the rest."""
 
 import hashlib
+import json
 import os
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFilter
 
 from stages import ingest
 from stages.contract import StageError
@@ -17,6 +18,7 @@ from stages.ingest.masks import STILL_BACKGROUND_HINT
 from stages.io.files import read_json
 from stages.io.photos import read_frame_names, read_photos
 from stages.io.pixels import load_pixels
+from stages.io.video import video_writer
 from tests.blots import blots, cut_out
 
 
@@ -219,8 +221,6 @@ def test_photos_that_are_all_nearly_the_same_are_no_scene(tmp_path: Path, progre
 
 
 def test_with_given_cameras_all_photos_are_used(tmp_path: Path, progress: Any) -> None:
-    import json
-
     folder = shifted(tmp_path / "in", 0, 1, 2)
     frames = [{"file_path": f"{index}.png", "transform_matrix": np.eye(4).tolist()} for index in range(3)]
     (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
@@ -276,8 +276,6 @@ def test_a_photo_whose_mask_cannot_be_used_is_refused(tmp_path: Path, progress: 
 
 
 def test_a_video_becomes_photos_with_times(tmp_path: Path, progress: Any) -> None:
-    from stages.io.video import video_writer
-
     wall = blots(0, 500, 200)
     with video_writer(tmp_path / "my clip.mp4", 160, 120, 10) as write:
         for step in range(24):
@@ -295,8 +293,6 @@ def test_a_video_becomes_photos_with_times(tmp_path: Path, progress: Any) -> Non
 
 
 def test_sharpness_orders_blur(tmp_path: Path, progress: Any) -> None:
-    from PIL import ImageFilter
-
     sharp = picture(0, 64, 64)
     for index, radius in enumerate((0, 1, 3)):
         sharp.filter(ImageFilter.GaussianBlur(radius)).save(tmp_path / f"{index}.png")
@@ -326,8 +322,6 @@ def test_terminal_codes_in_names_are_not_printed(tmp_path: Path, progress: Any) 
 
 
 def test_only_photos_named_by_the_cameras_are_taken(tmp_path: Path, progress: Any) -> None:
-    import json
-
     put(tmp_path, "images/a.png", "images/b.png", "images/unused.png")
     (tmp_path / "images/copy.png").write_bytes((tmp_path / "images/a.png").read_bytes())
     paths = ["images/a", "images/b.png", "images/copy.png", "images/gone.png"]

@@ -14,7 +14,7 @@ from PIL import Image
 from stages import ingest
 from stages.ingest.auxiliary_files import pair_masks
 from stages.ingest.decoding import DecodeError, upright
-from stages.ingest.masks import are_of_stored_pixels, read_mask, write_feature_masks
+from stages.ingest.masks import _same_shape, are_of_stored_pixels, read_mask, write_feature_masks
 from stages.ingest.sources import find_source
 from stages.io.files import write_png
 from stages.io.photos import Photo, read_photos
@@ -189,8 +189,6 @@ def test_a_mask_of_another_size_is_resized(factor: float, turned: bool, tmp_path
 @example(6000, 4000, 1600 / 6000)
 @given(st.integers(100, 6000), st.integers(100, 6000), st.floats(0.1, 2))
 def test_any_reduction_rounded_to_pixels_keeps_its_shape(width: int, height: int, scale: float) -> None:
-    from stages.ingest.masks import _same_shape
-
     reduced = max(1, round(width * scale)), max(1, round(height * scale))
     assert _same_shape(reduced, (width, height)) and _same_shape((width, height), reduced)
     assert not _same_shape((reduced[0] + width // 2 + 2, reduced[1]), (width, height)) or width > 50 * height

@@ -1,5 +1,6 @@
 """Pictures of which one is enough, and pictures that only look alike."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -37,8 +38,6 @@ def test_a_small_shift_of_everything_is_no_baseline(x: float, y: float) -> None:
 
 
 def test_a_small_turn_is_no_baseline() -> None:
-    import cv2
-
     turn = cv2.getRotationMatrix2D((WIDTH / 2, HEIGHT / 2), 1.0, 1.0)
     turned = cv2.warpAffine(seen(0), turn, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REPLICATE)
     assert found(seen(0), turned) == {1: 0}
@@ -82,8 +81,6 @@ def test_the_sharpest_stays_and_of_equals_the_first() -> None:
 
 
 def reduced(picture: np.ndarray, width: int) -> np.ndarray:
-    import cv2
-
     height = round(picture.shape[0] * width / picture.shape[1])
     return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
 
@@ -148,8 +145,6 @@ def test_what_turns_before_a_background_that_never_moves_is_another_picture_wher
 
 
 def test_the_answer_does_not_depend_on_threads() -> None:
-    import cv2
-
     pictures = [seen(2.0 * step, noise=step + 1) for step in range(6)]
     before = cv2.getNumThreads()
     try:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from hypothesis import given
@@ -114,8 +115,6 @@ def test_the_same_video_gives_the_same_bytes(threads: int, tmp_path: Path, progr
 
 @pytest.mark.parametrize(("turn", "quarters"), [(90, 1), (180, 2), (270, 3)])
 def test_a_turned_video_stands_upright(turn: int, quarters: int, tmp_path: Path, progress: Any) -> None:
-    import imageio_ffmpeg
-
     pictures = panned(*np.arange(6) / 6)
     stored, turned = clip(tmp_path / "a.mp4", pictures), tmp_path / "b.mp4"
     ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-display_rotation", str(turn)]
@@ -137,8 +136,6 @@ def test_a_turned_video_stands_upright(turn: int, quarters: int, tmp_path: Path,
     ],
 )
 def test_pixels_become_square(aspect: str, turn: int, size: tuple[int, int], tmp_path: Path, progress: Any) -> None:
-    import imageio_ffmpeg
-
     pictures = panned(*np.arange(6) / 6)
     square, stored = clip(tmp_path / "a.mp4", pictures), tmp_path / "b.mp4"
     ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-display_rotation", str(turn), "-i", str(square)]

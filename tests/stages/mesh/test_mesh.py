@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import torch
 import trimesh
@@ -280,8 +281,6 @@ def test_fields_without_a_surface_write_nothing(run_mesh, tmp_path, model, setti
 
 
 def test_a_grid_beyond_memory_is_refused_with_one_that_fits(run_mesh, monkeypatch):
-    import psutil
-
     memory = psutil.virtual_memory()._replace(available=16 * 40**3)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
     with refused("hardware.not-enough-memory", "the mesh") as error:

@@ -20,6 +20,7 @@ from stages.contract import StageError
 from stages.io.files import read_json, write_json
 from stages.io.transforms_export import transforms
 from stages.render.path import CameraPath, fitted_path, median_camera, path_from_file, path_rays, resized
+from stages.render.video import STARTING_SECONDS
 from tests.camera_layouts import ring, wall
 from tests.refusals import refused
 from tests.video_files import read_video
@@ -74,7 +75,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     monkeypatch.setattr(
         "stages.render.renderer.Renderer.rays_per_second", lambda self, sample, largest, seconds: 30_000
     )
-    monkeypatch.setattr("stages.io.field_files.load_field", lambda *_: (Ball(), info))
+    monkeypatch.setattr("stages.render.renderer.load_field", lambda *_: (Ball(), info))
     return folders
 
 
@@ -135,7 +136,7 @@ def test_depth_waits_on_the_disk_only_where_it_is_shown(inputs, progress, monkey
         yield lambda frame: waiting.append((path.parent / "inverse_depth.tmp").exists())
 
     waiting = list[bool]()
-    monkeypatch.setattr("stages.io.video.video_writer", writer)
+    monkeypatch.setattr("stages.render.video.video_writer", writer)
     run(inputs, progress, frames=3, width=40, depth=depth)
     assert waiting == (6 * [True] if depth else 3 * [False])
     assert not (inputs["render"] / "inverse_depth.tmp").exists()
@@ -230,7 +231,7 @@ def test_bearings_are_made_frame_by_frame_and_kept_while_the_lens_is_the_same(mo
         made.append((camera.params[0], weakref.ref(rays := np.zeros((height, width, 3), np.float32))))
         return rays
 
-    monkeypatch.setattr("stages.sfm.colmap.cameras.camera_rays", camera_rays)
+    monkeypatch.setattr("stages.render.path.camera_rays", camera_rays)
     lenses = [replace(CAMERA, params=(focal, *CAMERA.params[1:])) for focal in (150.0, 150.0, 151.0, 152.0)]
     frames = path_rays(CameraPath(tuple(lenses), ring(4)), scene_with(ring(5)))
     asked = []
@@ -344,7 +345,7 @@ def with_exposure(inputs, monkeypatch) -> None:
     info = read_json(inputs["train"] / "field.json") | {"exposure": {"neutral": [0.0] * 3, "photos": photos}}
     write_json(inputs["train"] / "field.json", info)
     shown = AppearanceModel(GreyBall(), (ExposureModel(torch.zeros(1, 3)),))
-    monkeypatch.setattr("stages.io.field_files.load_field", lambda *_: (shown, info))
+    monkeypatch.setattr("stages.render.renderer.load_field", lambda *_: (shown, info))
 
 
 class GreyBall(Ball):
@@ -398,5 +399,5 @@ def test_seconds_given_bound_the_video_whatever_training_took(inputs, progress, 
     config = render.plan(render.Config(seconds=seconds), inputs, progress)
     assert config.frames is not None and config.width is not None
     expected = config.frames * config.width**2 * 0.75 / 30_000
-    assert 0.4 * (seconds - render.STARTING_SECONDS) < expected < seconds
+    assert 0.4 * (seconds - STARTING_SECONDS) < expected < seconds
     assert f"given {seconds:g} s" in progress.notes[0].replace("1 min", "60 s")

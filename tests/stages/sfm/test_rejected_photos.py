@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,8 +14,6 @@ from tests.stages.sfm.sfm_inputs import SMALL, ingested
 
 def turned(angle: float, panorama: np.ndarray, size: tuple[int, int] = (240, 180), focal: float = 250.0) -> np.ndarray:
     """What a camera sees of a far picture after turning about its vertical axis."""
-    import cv2
-
     cos, sin = np.cos(angle), np.sin(angle)
     lens = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
     far = np.array([[focal, 0, panorama.shape[1] / 2], [0, focal, panorama.shape[0] / 2], [0, 0, 1]])

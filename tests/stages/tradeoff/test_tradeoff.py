@@ -20,7 +20,8 @@ from stages.io.files import read_json, read_scene, write_json
 from stages.tradeoff import Config, benchmark, schedule, study
 from stages.tradeoff.benchmark import score_workspace_field
 from stages.tradeoff.schedule import FEWER_RAYS, PUBLISHED, VARIANTS, WORKSPACE_FIELD, Run, Speed
-from stages.train.config import FieldName
+from stages.train.config import WHITE, FieldName
+from stages.train.data import PhotoReader, view_rays
 from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.fields.vanilla_options import VanillaOptions
 from tests.refusals import refused
@@ -349,9 +350,6 @@ def test_too_little_time_is_said_with_numbers(tmp_path: Path, photos: dict[str, 
 
 
 def test_windows_are_parts_of_the_photos(photos: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    from stages.train.config import WHITE
-    from stages.train.data import PhotoReader, view_rays
-
     monkeypatch.setattr(benchmark, "CROP_SIZE", 8)
     scene = read_scene(photos["normalise"])
     crops = benchmark.make_benchmark(photos["ingest"], scene, 1.0, 5, 2.0)

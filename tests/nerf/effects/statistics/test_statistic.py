@@ -1,3 +1,5 @@
+from math import log10
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -8,8 +10,6 @@ INFINITE = float("inf")
 
 
 def test_harm_is_what_costs_three_tenths_of_a_decibel_at_thirty() -> None:
-    from math import log10
-
     assert abs(-10 * log10(1e-3 + HARM**2) - 29.7) < 0.005
     assert abs(-10 * log10(1e-3 + (2 * HARM) ** 2) - 28.9) < 0.05
 

@@ -1,17 +1,13 @@
 """Reconstructions in memory whose lens is known exactly, for tests of its choice and of poses' uncertainty."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+import pycolmap
 
 from nerf.geometry.scene import Camera
 from stages.sfm.colmap.camera_model_selection import adjustment_options
 from stages.sfm.colmap.camera_models import set_camera_models
 from stages.sfm.colmap.cameras import native
 from stages.sfm.colmap.observations import observations, points_in_camera, residuals
-
-if TYPE_CHECKING:
-    import pycolmap
 
 WIDTH, HEIGHT = 900, 600
 
@@ -38,8 +34,6 @@ def photographed(
 
     The cameras take turns. Where points were seen is off by Gaussian noise (deviation of a coordinate in pixels).
     """
-    import pycolmap
-
     random = np.random.default_rng(seed)
     angle = 2.0 * np.arange(photos) / photos + random.normal(0, 0.05, photos)
     around = np.stack([np.cos(angle), np.sin(angle), random.uniform(0.1, 0.5, photos)], axis=1)
@@ -75,8 +69,6 @@ def photographed(
 
 def adjust(model: "pycolmap.Reconstruction", principal_point: bool = False, intrinsics: bool = True) -> None:
     """Bundle adjustment as the stage does it, for a noise of half a pixel."""
-    import pycolmap
-
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)
@@ -89,8 +81,6 @@ def adjust(model: "pycolmap.Reconstruction", principal_point: bool = False, intr
 
 def mapped(truth: "pycolmap.Reconstruction", widest: float = 180.0) -> "pycolmap.Reconstruction":
     """What mapping would leave: SIMPLE_RADIAL, centred, without observations 4 px off or beyond an angle (degrees)."""
-    import pycolmap
-
     model = pycolmap.Reconstruction(truth)
     for image_id, (mine, points) in points_in_camera(model, seen := observations(model)).items():
         off = np.degrees(np.arctan2(np.linalg.norm(points[:, :2], axis=1), points[:, 2]))

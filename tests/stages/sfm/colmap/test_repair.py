@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
+import pycolmap
 import pytest
 
 from stages.io.photos import Photo
@@ -34,8 +35,6 @@ def made(tmp_path: Path) -> Made:
 
 
 def make(folder: Path, points: int = 400) -> Made:
-    import pycolmap
-
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(
         num_rigs=1, num_frames_per_rig=PHOTOS, num_points3D=points, num_points2D_without_point3D=20
@@ -49,8 +48,6 @@ def make(folder: Path, points: int = 400) -> Made:
 
 def turn(model: Any, image_id: int, degrees: float) -> None:
     """Turn a registered photo where it stands."""
-    import pycolmap
-
     image = model.image(image_id)
     turned = pycolmap.Rigid3d(pycolmap.Rotation3d(np.radians([0.0, degrees, 0.0])), np.zeros(3))
     frame = model.frame(image.frame_id)
@@ -82,8 +79,6 @@ def test_a_turned_photo_is_named_and_registered_again(made: Made, tmp_path: Path
 
 def test_a_photo_whose_matches_are_all_wrong_is_excluded_with_a_reason(made: Made) -> None:
     """Ten in a hundred photos with injected matches: here photo 5 has keypoints of others' points."""
-    import pycolmap
-
     random = np.random.default_rng(0)
     with pycolmap.Database.open(made.database) as db, pycolmap.DatabaseTransaction(db):
         for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
@@ -104,8 +99,6 @@ def test_a_photo_whose_matches_are_all_wrong_is_excluded_with_a_reason(made: Mad
 
 
 def test_mapping_of_thinned_matches_finds_the_same_cameras(tmp_path: Path) -> None:
-    import pycolmap
-
     made = make(tmp_path, points=1000)
     thinned = tmp_path / "thinned.db"
     thin_matches(made.database, thinned, tracks=30)
@@ -137,16 +130,12 @@ def test_matches_consistent_with_trusted_pairs_are_kept(made: Made, tmp_path: Pa
 
 def turned_alone(made: Made, image_id: int) -> Any:
     """The true model but for one photo that is turned."""
-    import pycolmap
-
     wrong = pycolmap.Reconstruction(made.model)
     turn(wrong, image_id, degrees=3.0)
     return wrong
 
 
 def verified_pairs(database: Path) -> set[tuple[int, int]]:
-    import pycolmap
-
     with pycolmap.Database.open(database) as db:
         ids, _ = db.read_two_view_geometries()
     return {pycolmap.pair_id_to_image_pair(pair_id) for pair_id in ids}
@@ -168,8 +157,6 @@ def test_the_log_of_a_copy_whose_process_was_killed_is_not_taken_for_the_next_on
 
 
 def test_global_mapping_runs_beside_and_agrees(made: Made, tmp_path: Path) -> None:
-    import pycolmap
-
     started = global_mapping.start(
         made.database, tmp_path / "thinned.db", tmp_path, tmp_path / "global", 0, camera_is_known=False
     )
@@ -188,8 +175,6 @@ def test_what_global_mapping_dies_of_is_told(tmp_path: Path) -> None:
 
 
 def test_models_that_disagree_name_images_with_different_poses(made: Made) -> None:
-    import pycolmap
-
     other = pycolmap.Reconstruction(made.model)
     for image_id in (3, 9):
         turn(other, image_id, degrees=40.0)

@@ -1,6 +1,7 @@
 from unittest.mock import Mock
 
 import numpy as np
+import pycolmap
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -57,8 +58,6 @@ def test_it_is_how_far_poses_spread_over_repeated_noise() -> None:
 
 
 def test_it_does_not_depend_on_where_the_world_is() -> None:
-    import pycolmap
-
     model = photographed(CAMERA, photos=PHOTOS, points=POINTS)
     here = pose_uncertainty_px(model, 0.5)
     rotation = pycolmap.Rotation3d(Rotation.from_rotvec([0.5, -1.0, 2.0]).as_quat())
