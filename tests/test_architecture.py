@@ -24,6 +24,7 @@ COLMAP = "stages/sfm/colmap/"
 MAX_FUNCTION_LINES, MAX_ARGUMENTS, MAX_MEDIAN_FUNCTION_LINES = 60, 8, 20
 MAX_KERNEL_ARGUMENTS = 16
 MAX_ENTRIES = 15
+MAX_TEST_NAME_WORDS = 10
 ALLOWED_BASES = {"Module", "Function", "Exception", "BaseException", "Enum", "IntEnum", "NamedTuple", "Protocol"} | {
     "BaseModel",
     "Options",
@@ -273,6 +274,12 @@ def hidden_zeros(module: Module) -> Iterator[str]:
                     yield ast.unparse(node)
 
 
+def long_test_names(module: Module) -> Iterator[str]:
+    for function in functions(module.tree):
+        if function.name.startswith("test_") and function.name.count("_") > MAX_TEST_NAME_WORDS:
+            yield function.name
+
+
 def test_imports_go_one_way():
     assert offenders(imports_against_the_current, OURS) == []
 
@@ -339,6 +346,10 @@ def test_inheritance_is_rare():
     assert offenders(unusual_bases, OURS) == []
 
 
+def test_names_of_tests_have_few_words():
+    assert offenders(long_test_names, AROUND) == []
+
+
 def test_nothing_masks_a_fault():
     assert offenders(masked_faults, OURS) == []
 
@@ -366,6 +377,7 @@ BROKEN: dict[Rule, list[tuple[str, str]]] = {
         ("nerf/a.py", "from pathlib import Path"),
         ("nerf/a.py", "open('a')"),
     ],
+    long_test_names: [("tests/a.py", f"def test{'_a' * (MAX_TEST_NAME_WORDS + 1)}(): 1")],
     users_of_pycolmap: [("stages/sfm/a.py", "import pycolmap")],
     names_without_a_subject: [("stages/sfm/utils.py", "")],
     long_functions: [("a.py", "def f():\n" + "    x = 1\n" * MAX_FUNCTION_LINES)],

@@ -74,7 +74,7 @@ def seen(folder: Path, inputs: dict[str, Path], progress: Any) -> tuple[float, f
 @pytest.mark.parametrize("steps", [WARM_UP - 20, WARM_UP + 20])
 @pytest.mark.parametrize("rate", [*(pytest.param(rate, marks=pytest.mark.slow) for rate in (1e-1, 1.0)), 10.0])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_rate_far_too_high_never_gives_a_bad_model_in_silence(
+def test_a_far_too_high_rate_is_never_silent(
     kind: str, rate: float, steps: int, inputs: dict[str, Path], tmp_path: Path, progress: Any
 ) -> None:
     try:
@@ -92,7 +92,7 @@ def test_a_rate_far_too_high_never_gives_a_bad_model_in_silence(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_field_that_is_lost_after_its_warm_up_goes_back(
+def test_a_field_lost_after_warm_up_goes_back(
     kind: str, inputs: dict[str, Path], tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spoil_once_at(WARM_UP + 20, _forget, monkeypatch, kind)
@@ -189,7 +189,7 @@ def test_every_checkpoint_of_a_sound_run_is_sound(kind: str, inputs: dict[str, P
 
 
 @pytest.mark.parametrize("other", [{"log2_hashmap_size": 11}, {"max_res": 31}, {"num_levels": 3}])
-def test_a_checkpoint_of_another_field_is_said_aloud_and_the_one_before_goes_on(
+def test_a_checkpoint_of_another_field_is_named_and_skipped(
     other: dict[str, int], inputs: dict[str, Path], tmp_path: Path, progress: Any
 ) -> None:
     _checkpoint_of_another(tmp_path, inputs, progress, "torch", {"grid": KINDS["torch"]["grid"] | other})
@@ -240,7 +240,7 @@ def train_loop_trainer(inputs: dict[str, Path], dataset: RayDataset) -> HashGrid
 
 
 @pytest.mark.parametrize("poison", [float("nan"), float("inf"), float("-inf")])
-def test_a_float_photo_with_pixels_that_are_no_numbers_is_refused_by_name(tmp_path: Path, poison: float) -> None:
+def test_a_float_photo_with_nan_is_refused_by_name(tmp_path: Path, poison: float) -> None:
     values = np.full((20, 30), 0.5, np.float32)
     Image.fromarray(values).save(tmp_path / "fine.tif")
     values[3, 4] = poison

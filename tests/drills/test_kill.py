@@ -63,7 +63,7 @@ def videos_plan(workspace: Path) -> dict[str, Any]:
     return next(plan for plan in plans if plan["depth"] is False)
 
 
-def test_a_killed_video_goes_on_with_the_size_that_was_chosen_for_it(chain: Chain, tmp_path: Path):
+def test_a_killed_video_resumes_at_the_chosen_size(chain: Chain, tmp_path: Path):
     workspace = copy_workspace(chain.workspace, tmp_path / "w.nerf")
     open_again = "--render.frames None --render.width None --render.no-depth".split()
     assert kill_in("render", Program(["render", str(workspace), "--json", *open_again], tmp_path / "says"), 0.0)

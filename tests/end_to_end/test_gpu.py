@@ -36,7 +36,7 @@ def heldout_psnr(photos: Path, workspace: Path, *flags: str) -> float:
     return curve["points"][-1]["heldout_psnr"]
 
 
-def test_the_chain_ends_with_a_field_that_looks_the_same_on_the_cpu(tmp_path: Path) -> None:
+def test_the_chain_on_a_gpu_agrees_with_the_cpu(tmp_path: Path) -> None:
     photos = write_blender_scene(tmp_path / "photos", train=14, test=3)
     assert run_command(["run", str(photos), "-o", str(tmp_path / "w.nerf"), *SMALL]) == 0
     summary = read_json(tmp_path / "w.nerf/output/summary.json")

@@ -108,7 +108,7 @@ def test_a_photo_of_another_scene_is_left_out(tmp_path: Path) -> None:
     assert 0 < max(max(pair) for pair in errors(folder, OUTLIER).values()) < 1
 
 
-def test_of_two_groups_the_larger_is_taken_and_the_other_named(tmp_path: Path) -> None:
+def test_the_larger_of_two_groups_is_taken(tmp_path: Path) -> None:
     folder, notes = found(tmp_path, TWO_GROUPS)
     why = "it belongs to another group of 7 photos that does not connect to this one"
     assert missing(folder) == {shot.name: why for shot in TWO_GROUPS if shot.scene == PLANE}

@@ -43,14 +43,14 @@ def test_a_refusal_does_not_repeat_what_may_have_any_length(name: str, file: str
 
 
 @pytest.mark.parametrize("error", [float("nan"), float("inf"), 1e308])
-def test_what_a_colmap_model_says_of_its_own_errors_is_not_believed(error: float) -> None:
+def test_a_colmap_models_own_errors_are_not_believed(error: float) -> None:
     files = dict(colmap_models()["bin"])
     points = bytearray(files["points3D.bin"])
     struct.pack_into("<d", points, 8 + 8 + 24 + 3, error)
     assert attempt(LOADERS["colmap binary"], {**files, "points3D.bin": bytes(points)})
 
 
-def test_a_lens_that_cannot_be_undone_is_refused_where_it_is_given() -> None:
+def test_a_lens_without_an_inverse_is_refused() -> None:
     files = dict(colmap_models()["bin"])
     cameras = bytearray(files["cameras.bin"])
     struct.pack_into("<d", cameras, 8 + 24 + 32, 1e16)

@@ -109,7 +109,7 @@ def test_a_transforms_file_names_photos_of_its_own_folder_alone(name: str, tmp_p
     assert refused.value.what == f"rejected the photo {name!r}"
 
 
-def test_a_transforms_files_own_word_for_a_photo_leads_nowhere_either(tmp_path: Path) -> None:
+def test_a_transforms_files_photo_name_leads_nowhere(tmp_path: Path) -> None:
     picture(tmp_path / "secret.png")
     folder = picture(tmp_path / "set" / "b.png").parent
     frame = {"file_path": "b.png", "photo": "../secret.png", "transform_matrix": np.eye(4).tolist()}

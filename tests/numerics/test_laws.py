@@ -196,7 +196,7 @@ def test_a_grid_without_a_surface_is_refused(density: float) -> None:
 
 
 @pytest.mark.parametrize("density", [1e4, 1e30])
-def test_a_block_of_full_vertices_is_a_closed_surface_and_a_single_one_is_too_thin(
+def test_full_vertices_close_a_surface_single_ones_vanish(
     density: float,
 ) -> None:
     values = torch.zeros(7, 7, 7)

@@ -151,7 +151,7 @@ def test_a_wrong_value_or_gradient_is_found() -> None:
     assert not Measured(0.0, float("inf"), 1).within(good)
 
 
-def test_a_made_up_loss_is_the_same_again_and_of_no_special_direction() -> None:
+def test_the_cotangent_repeats_and_favours_no_direction() -> None:
     assert torch.equal(cotangent(torch.zeros(5, 3)), cotangent(torch.ones(5, 3)))
     assert 0.8 < cotangent(torch.zeros(10_000)).std() < 1.2
 

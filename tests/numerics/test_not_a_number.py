@@ -25,7 +25,7 @@ def with_nan(values: torch.Tensor) -> torch.Tensor:
 
 
 @BACKENDS
-def test_a_density_that_is_not_a_number_is_not_taken_for_a_solid(backend: Backend) -> None:
+def test_nan_density_is_no_solid(backend: Backend) -> None:
     """Warp's min takes NaN for missing: limited by it to OPAQUE, a broken density looked solid and the loss finite."""
     colour, background, far = torch.full((5, 3), 0.5), torch.zeros(2, 3), torch.ones(2)
     rendering, weights = backend.composite(SAMPLES, with_nan(torch.ones(5)), colour, background, far)
@@ -45,7 +45,7 @@ def test_a_colour_that_is_not_a_number_reaches_the_picture(backend: Backend) -> 
 
 
 @BACKENDS
-def test_a_hidden_unit_that_is_not_a_number_is_not_rectified(backend: Backend) -> None:
+def test_a_nan_hidden_unit_is_not_rectified(backend: Backend) -> None:
     hidden = with_nan(torch.full((5, 64), -1.0))
     backend.add_ray_relu(SAMPLES, hidden, torch.zeros(2, 64))
     assert hidden[1].isnan().all() and not hidden[[0, 2, 3, 4]].any()
@@ -62,7 +62,7 @@ def test_a_cell_of_no_known_thickness_is_looked_into(backend: Backend) -> None:
 
 
 @BACKENDS
-def test_a_cell_where_a_value_is_not_a_number_has_none(backend: Backend) -> None:
+def test_a_cell_with_nan_has_no_value(backend: Backend) -> None:
     """Before and behind other values of its cell, and whatever the cell is told afterwards."""
     thickness, along_z = torch.full((64,), 0.5), torch.tensor([0, 1, 1, 2, 2, 3])
     values = torch.tensor([2.0, 2.0, math.nan, math.nan, 2.0, 3.0])

@@ -197,7 +197,7 @@ def fog_rays() -> Rays:
     return Rays(torch.zeros(5, 3), torch.zeros(5, 3), torch.zeros(5), torch.linspace(0, 1, 5))
 
 
-def test_an_exposed_model_shows_the_scene_at_its_gain_and_the_background_as_it_is():
+def test_exposure_scales_the_scene_and_not_the_background():
     log_gain = torch.tensor([0.5, 0.0, -0.5])
     model = AppearanceModel(Fog(), (ExposureModel(log_gain[None]),))
     assert isinstance(model, RadianceModel) and model.chunk_rays == 77
@@ -215,7 +215,7 @@ def test_an_exposed_model_shows_the_scene_at_its_gain_and_the_background_as_it_i
     assert torch.equal(seen.depth, plain.depth) and torch.equal(seen.opacity, plain.opacity)
 
 
-def test_a_model_exposed_at_no_gain_is_the_model_bit_for_bit():
+def test_zero_gain_is_the_model_bit_for_bit():
     background = torch.tensor([0.2, 0.9, 0.4])
     seen = AppearanceModel(Fog(), (ExposureModel(torch.zeros(1, 3)),)).render(fog_rays(), background)
     assert all(torch.equal(*pair) for pair in zip(seen, Fog().render(fog_rays(), background), strict=True))

@@ -98,7 +98,7 @@ def test_extremes_are_finite_in_value_and_gradient(log_gain: float, kind: torch.
         assert of_rendering.colour.abs().max() > 0
 
 
-def test_the_darkest_photo_shows_the_field_as_it_is_and_the_mean_gain_is_kept() -> None:
+def test_the_mean_gain_is_kept_by_the_gauge() -> None:
     part = ExposureModel.initial(TrainingImages(torch.zeros(3, 3, 4)), GAINS)
     assert torch.equal(part.log_gain.amin(0), torch.zeros(3).double())
     torch.testing.assert_close(part.log_gain - part.log_gain[:1], GAINS - GAINS[:1])

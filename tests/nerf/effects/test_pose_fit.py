@@ -26,7 +26,7 @@ class Small(HashGridField):
         return origins / SMALLER, directions
 
 
-def test_the_pose_found_in_a_smaller_scene_is_the_same_but_smaller() -> None:
+def test_a_fitted_pose_scales_with_the_scene() -> None:
     random = torch.Generator().manual_seed(1)
     directions = 0.3 * torch.randn(100, 3, generator=random) + torch.tensor([0.0, 0, 1])
     directions = torch.nn.functional.normalize(directions, dim=-1)

@@ -135,7 +135,7 @@ def refined(scale: float) -> tuple[PoseRefinement, float]:
     return poses, float(left.max())
 
 
-def test_in_a_small_scene_poses_are_refined_as_well_as_in_a_large_one() -> None:
+def test_poses_are_refined_alike_at_any_scene_size() -> None:
     (large, off), (small, off_in_small) = refined(1.0), refined(1 / 20)
     assert 1e-5 < off < 2e-3, "by less than a photo's noise"
     assert off_in_small == pytest.approx(off, rel=0.02)

@@ -50,7 +50,7 @@ def make_rays(origins, directions, near=0.0, far=10.0):
     return Rays(origins, directions, torch.full((len(origins),), near), torch.full((len(origins),), far))
 
 
-def test_values_lie_at_the_vertices_and_the_corners_on_the_box():
+def test_values_lie_at_vertices_and_corners_on_the_box():
     grid = sample_density_grid(Field(linear), 7, LOW, HIGH)
     assert grid.values.shape == (7, 7, 7)
     index = torch.tensor([[0, 0, 0], [6, 6, 6], [1, 4, 2]])
@@ -95,7 +95,7 @@ def test_interpolation_is_exact_for_trilinear_functions_and_zero_outside():
     assert (trilinear(grid, points + torch.tensor([5.0, 0, 0])) == 0).all()
 
 
-def test_occupancy_is_a_half_at_the_level_and_bounded_over_sixty_decades():
+def test_occupancy_is_bounded_over_sixty_decades():
     density = torch.tensor([0.0, 1e-30, 1.0, 7.0, 1e4, 1e30])
     values = occupancy(DensityGrid(density.reshape(1, 1, 6), LOW, HIGH), 7.0).values.flatten()
     assert float(values[3]) == pytest.approx(0.5, abs=1e-7)
@@ -107,7 +107,7 @@ def test_optical_depth_of_a_linear_density_is_a_parabola():
     torch.testing.assert_close(optical_depth(4 * t, t), 2 * (t**2 - 1))
 
 
-def test_first_crossing_is_the_first_exact_on_lines_and_infinite_without_one():
+def test_first_crossing_is_exact_on_lines_infinite_without_one():
     t = torch.tensor([[0.0, 1.0, 2.0, 3.0]]).expand(4, 4)
     values = torch.tensor([[0.0, 1, 0, 5], [0, 0, 0, 4], [2, 0, 0, 0], [0, 0, 0, 0.4]])
     torch.testing.assert_close(first_crossing(values, t, 0.5), torch.tensor([0.5, 2.125, 0.0, torch.inf]))
@@ -130,7 +130,7 @@ def test_what_rays_meet_is_what_lies_there():
     torch.testing.assert_close(along(grid, rays, t)[:, 1:-1], linear(points)[:, 1:-1], atol=1e-4, rtol=0)
 
 
-def test_smoothing_averages_neighbours_and_takes_what_is_beyond_the_box_for_its_side():
+def test_smoothing_averages_neighbours_and_repeats_the_border():
     values = torch.zeros(5, 4, 3)
     values[2, 0, 1] = 1.0
     once = smoothed(DensityGrid(values, LOW, HIGH), 1).values
@@ -139,7 +139,7 @@ def test_smoothing_averages_neighbours_and_takes_what_is_beyond_the_box_for_its_
     assert torch.equal(smoothed(DensityGrid(values, LOW, HIGH), 0).values, values)
 
 
-def test_smoothing_is_a_gaussian_of_the_passes_and_leaves_a_step_where_it_is():
+def test_smoothing_is_a_gaussian_that_keeps_steps_in_place():
     line = (torch.arange(40) >= 20).double().expand(3, 3, 40)
     smooth = smoothed(DensityGrid(line, LOW, HIGH), 2).values[1, 1]
     slope = smooth.diff()

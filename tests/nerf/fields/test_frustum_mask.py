@@ -73,7 +73,7 @@ def projected(views: RayDataset, points: torch.Tensor, near: float, half: float)
 
 @pytest.mark.parametrize("half", [0.15, 0.5, 1.3])
 @pytest.mark.parametrize("least", [1, 2, 3, 4])
-def test_a_cell_is_usable_where_enough_photos_look_or_one_from_its_foreground_on(half: float, least: int) -> None:
+def test_a_cell_needs_enough_photos_or_a_foreground(half: float, least: int) -> None:
     views = dataset(half=half)
     usable, points = compute_frustum_mask(views, least, 64), middles(64)
     photos = projected(views, points, NEAR, half)
@@ -89,7 +89,7 @@ def test_a_cell_is_usable_where_enough_photos_look_or_one_from_its_foreground_on
         assert (~usable & (photos > 0)).any() == (least > 1)
 
 
-def test_photos_that_look_together_find_what_each_finds_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photos_together_find_what_each_finds(monkeypatch: pytest.MonkeyPatch) -> None:
     threads, found = torch.get_num_threads(), []
     try:
         for count, together in ((1, 1), (2, 2), (2, 16)):
@@ -121,7 +121,7 @@ def test_all_trainers_of_a_bank_ask_once(monkeypatch: pytest.MonkeyPatch) -> Non
     assert len(asked) == 12, "another dataset, and another question"
 
 
-def test_what_one_photo_sees_alone_before_its_foreground_is_left_empty() -> None:
+def test_space_before_one_photos_foreground_is_left_empty() -> None:
     along = torch.tensor([[2.5 - t, 0.0, 0.0] for t in (-3.0, 0.4, 1.2, 1.7, 2.5, 20.0)])
     usable = compute_frustum_mask(dataset(2), 2, 64)
     numbers = cell_numbers(64, unit_coordinates(along, True)).long()

@@ -150,7 +150,7 @@ def test_density_agrees_with_what_rays_see() -> None:
     assert rendering.opacity.min() > 0.05 and samples.dt.max() == pytest.approx(step)
 
 
-def test_folded_space_is_drawn_with_closer_samples_than_it_is_trained_with() -> None:
+def test_contracted_space_is_rendered_with_closer_samples_than_trained() -> None:
     """The opacity of a drawn ray by the middle rule with shorter steps; a box keeps its own."""
     model, given = field(FOLDED), rays()
     closer = model.stepping._replace(
@@ -175,7 +175,7 @@ def test_closed_cells_are_not_seen() -> None:
 
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED])
-def test_the_density_beside_a_colour_is_the_density_zero_in_closed_cells_and_beyond_the_box(
+def test_density_is_zero_in_empty_cells_and_beyond_the_box(
     settings: HashGridSettings,
 ) -> None:
     model = field(settings)
@@ -212,7 +212,7 @@ def test_a_new_sky_is_a_grey_background_bit_for_bit(backend: Backend) -> None:
 
 
 @BACKENDS
-def test_view_dependence_without_weight_is_a_diffuse_field_bit_for_bit(backend: Backend) -> None:
+def test_zero_view_dependence_is_diffuse_bit_for_bit(backend: Backend) -> None:
     dependent, diffuse = HashGridField(SMALL, 1, backend), HashGridField(DIFFUSE, 1, backend)
     dependent.colour_hidden[mlp.GEOMETRY :] = 0
     weights = dependent.state_dict()
@@ -353,7 +353,7 @@ def test_what_is_empty_follows_from_what_is_occupied() -> None:
 
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED])
-def test_waves_of_compiled_kernels_see_what_a_single_pass_of_them_sees(
+def test_compiled_rounds_see_what_a_single_pass_sees(
     settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model, given = (
@@ -375,7 +375,7 @@ def test_waves_of_compiled_kernels_see_what_a_single_pass_of_them_sees(
 @pytest.mark.parametrize("settings", [SMALL, FOLDED])
 @pytest.mark.parametrize("lengths", [(1, 1, 1), (80, 2, 64)])
 @pytest.mark.parametrize("dense", [False, True])
-def test_training_keeps_the_samples_of_a_single_pass_whatever_the_waves(
+def test_training_keeps_all_samples_whatever_the_rounds(
     settings: HashGridSettings, lengths: tuple[int, int, int], dense: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     in_short_rounds(monkeypatch, *lengths)

@@ -29,9 +29,7 @@ def cache_of_a_slope(axis: int, monkeypatch: pytest.MonkeyPatch) -> OccupancyGri
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_young_field_is_measured_everywhere_each_cell_in_its_block(
-    axis: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_young_field_is_measured_in_every_cell(axis: int, monkeypatch: pytest.MonkeyPatch) -> None:
     cache = cache_of_a_slope(axis, monkeypatch)
     cache.update(15, torch.Generator().manual_seed(0))
     block = (CELLS * cell_corners(CELLS, NUMBERS)[:, axis] / 2).floor()

@@ -71,7 +71,7 @@ def test_motion_is_smooth_and_more_frames_make_smaller_steps(path: str) -> None:
     assert 0 < fine.max() < 0.8 * coarse.max()
 
 
-def test_orbit_stands_where_the_cameras_stood_and_looks_where_they_looked() -> None:
+def test_orbit_stands_and_looks_as_the_cameras_did() -> None:
     poses = orbit(ring(radius=4.0, height=1.5), 36)
     centres = poses[:, :, 3]
     np.testing.assert_allclose(np.hypot(centres[:, 0], centres[:, 1]), 4.0, atol=1e-6)
@@ -90,7 +90,7 @@ def test_orbit_looks_where_the_cameras_near_each_frame_look() -> None:
     assert off.max() < 6 and off.mean() < 3  # 11 and 6 where all look at one point
 
 
-def test_orbit_of_an_arc_stays_within_the_arc_and_reaches_its_ends() -> None:
+def test_orbit_of_an_arc_stays_within_it() -> None:
     centres = orbit(ring(arc_deg=100.0), 60)[:, :, 3]
     from_middle = np.degrees(np.arctan2(centres[:, 0], -centres[:, 1]))
     assert np.abs(from_middle).max() == pytest.approx(50, abs=0.5)
@@ -118,7 +118,7 @@ def test_orbit_from_straight_above_keeps_a_horizon() -> None:
     assert np.isfinite(orbit(poses, 12)).all()
 
 
-def test_spiral_stays_within_the_grid_of_cameras_and_looks_into_the_scene() -> None:
+def test_spiral_stays_among_the_cameras_and_looks_inwards() -> None:
     cameras = wall()
     poses = spiral(cameras, 60)
     low, high = cameras[:, :, 3].min(axis=0), cameras[:, :, 3].max(axis=0)
@@ -145,7 +145,7 @@ def test_a_spiral_suits_photos_that_look_where_it_looks(cameras: np.ndarray, sui
     assert off.max() < 15  # from the direction of some photo
 
 
-def test_orbits_of_rings_and_domes_keep_clear_but_not_those_of_photos_from_near_and_far() -> None:
+def test_orbits_keep_clear_but_not_between_near_and_far() -> None:
     """Of an object of radius 1; far away something else stands before the photos, too."""
 
     def clear(cameras: np.ndarray) -> bool:
@@ -166,7 +166,7 @@ def test_a_spiral_beside_a_walk_does_not_keep_clear() -> None:
     assert keeps_clear(spiral(wall(), 120), wall(), np.full(24, 0.3))
 
 
-def test_a_path_zooms_with_the_photos_and_not_where_lenses_were_changed_on_the_spot() -> None:
+def test_a_path_zooms_with_photos_but_not_with_lens_changes() -> None:
     cameras = np.concatenate([ring(4, radius=1.0, arc_deg=10.0), ring(4, radius=9.0, arc_deg=10.0)])
     focals = np.repeat([0.5, 4.0], 4)
     focal = zoomed(cameras, focals, interpolated(cameras, 40))
@@ -177,14 +177,14 @@ def test_a_path_zooms_with_the_photos_and_not_where_lenses_were_changed_on_the_s
     np.testing.assert_allclose(zoomed(around, np.full(24, 1.3), orbit(around, 5)), 1.3)
 
 
-def test_a_video_of_flights_to_and_fro_does_not_flip_with_them() -> None:
+def test_a_video_of_flights_to_and_fro_never_flips() -> None:
     flown = survey(9, 9) / np.array([1, 1, 1, 100.0])
     assert turns(interpolated(flown, 120)).max() > 150
     assert turns(interpolated(levelled(flown), 120)).max() < 1e-3
     np.testing.assert_allclose(levelled(flown)[:, :, 2:], flown[:, :, 2:], atol=1e-12)
 
 
-def test_photos_of_a_wall_that_lie_on_their_side_are_set_upright() -> None:
+def test_sideways_photos_of_a_wall_are_set_upright() -> None:
     upright = facing(wall()[:, :, 3], np.random.default_rng(0).normal([0, 1.0, 0], 0.2, (24, 3)))
     upright[3, :, :3] = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]  # looks straight down: nothing to set
     turned = upright.copy()
@@ -239,7 +239,7 @@ def test_interpolated_walks_around_a_wall_as_the_photos_do(frames: int, ahead: b
     assert fine[fine[:, 0] > 6, 0].max() > 6.7
 
 
-def test_interpolated_stays_as_near_to_photos_as_they_are_to_each_other() -> None:
+def test_interpolated_stays_near_the_photos() -> None:
     """Far apart are only the ends of a way that winds through the scene: a helix of three turns."""
     angle = np.linspace(0, 6 * np.pi, 60)
     centres = np.stack([np.cos(angle), np.sin(angle), 0.3 * angle], axis=1)
@@ -261,7 +261,7 @@ def test_interpolated_joins_groups_of_photos_where_they_are_nearest() -> None:
     np.testing.assert_allclose(between[:, 0], between[:, 1], atol=0.5)
 
 
-def test_interpolated_does_not_shake_as_the_hands_did_that_took_many_photos() -> None:
+def test_interpolated_does_not_shake_with_the_hands() -> None:
     random = np.random.default_rng(0)
     centres = np.stack([np.linspace(0, 15, 300), *random.normal(scale=0.05, size=(2, 300))], axis=1)
     path = interpolated(facing(centres, random.normal([1.0, 0, 0], 0.05, (300, 3))), 120)

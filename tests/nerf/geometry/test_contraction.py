@@ -13,7 +13,7 @@ def test_the_unit_cube_stays_as_it_is() -> None:
     assert torch.equal(contract(inside), inside)
 
 
-def test_distance_goes_to_two_minus_its_inverse_along_the_same_direction() -> None:
+def test_distance_becomes_two_minus_its_inverse() -> None:
     y = contract(torch.tensor([[4.0, -2.0, 0.0]]))
     torch.testing.assert_close(y, torch.tensor([[1.75, -0.875, 0.0]]))
 

@@ -87,7 +87,7 @@ def test_noise_across_a_straight_walk_tells_no_direction(seed: int) -> None:
     assert georeference(SFM_FROM_ENU.points(winding), places(told)) == ONE_LINE
 
 
-def test_places_that_have_nothing_to_do_with_the_photos_are_refused() -> None:
+def test_gps_unrelated_to_the_photos_is_refused() -> None:
     told = np.random.default_rng(1).normal(0, 60, (12, 3))
     why = georeference(SFM_FROM_ENU.points(walked()), places(told))
     assert isinstance(why, str)

@@ -30,7 +30,7 @@ def test_what_photos_have_before_them_is_nearer_from_further_ahead() -> None:
     assert ranges((0.0, 0, -1.0))[0] == MIN_NEAR
 
 
-def test_where_photos_see_nearer_than_usual_so_do_cameras_between_them() -> None:
+def test_cameras_between_near_photos_see_near_too() -> None:
     """As above the ground in a survey that is long beside its height."""
     pose = np.concatenate([np.eye(3), PHOTOS[0][:, None]], axis=1)[None]
     near, _ = near_and_far_between_views(pose, PHOTOS, 0.01 * NEAR, FAR, bounded=False)

@@ -53,13 +53,13 @@ def test_layouts_are_told_apart(capture_type: str) -> None:
     assert find_capture_type(SCENES[capture_type]()) == capture_type
 
 
-def test_an_arc_that_converges_is_around_and_a_narrow_one_is_forward() -> None:
+def test_a_wide_arc_is_around_a_narrow_one_forward() -> None:
     assert find_capture_type(seen_by(ring(arc_deg=110.0), ball())) == "around"
     assert find_capture_type(seen_by(ring(arc_deg=30.0), ball())) == "forward"
 
 
 @pytest.mark.parametrize("capture_type", SCENES)
-def test_the_region_holds_nearly_all_that_is_seen_and_is_filled_by_it(capture_type: str) -> None:
+def test_the_region_is_filled_by_what_is_seen(capture_type: str) -> None:
     scene = SCENES[capture_type]()
     found = normalise(scene, None)
     reach = np.abs(found.scene_from_sfm.points(scene.points))[np.unique(scene.point)].max(axis=1)
@@ -83,7 +83,7 @@ def test_a_facade_faces_plus_y() -> None:
 
 
 @pytest.mark.parametrize("shaken", [0.0, 0.02])
-def test_the_ground_lies_flat_and_in_line_with_the_flight_over_it(shaken: float) -> None:
+def test_the_ground_lies_flat_along_the_flight(shaken: float) -> None:
     """Where photos look along up their axes have no heading but noise."""
     poses = survey()
     poses[:, :, :3] = nearest_rotations(poses[:, :, :3] + np.random.default_rng(1).normal(0, shaken, (48, 3, 3)))
@@ -174,14 +174,14 @@ def test_far_lies_behind_what_only_other_photos_have_points_of() -> None:
     assert found.far[0] == 20  # it looks away
 
 
-def test_what_is_twenty_times_nearer_than_the_rest_of_a_photo_is_no_false_match_where_many_points_say_so() -> None:
+def test_near_clusters_of_many_points_are_no_false_matches() -> None:
     scene = SCENES["around"]()
     rail = scene.centres[0] + 0.05 * scene.axes[0] + 0.01 * ball(30)
     found, clean = normalise(with_points(scene, rail, 4), None), normalise(scene, None)
     assert found.near[0] < 0.05 * found.scene_from_sfm.scale < 0.05 * clean.near[0] / 0.7 * 3
 
 
-def test_in_a_scene_that_is_large_beside_its_distances_near_lies_before_what_photos_see() -> None:
+def test_near_lies_before_what_photos_see_in_large_scenes() -> None:
     """A flight of 3 km at 40 m, over ground with a mast on it that photo 0 has no points of."""
     scene = seen_by(survey(lines=2, photos=100, height=40.0), ground(1500.0, 5.0, 40_000))
     mast = scene.centres[0] + 30.0 * scene.axes[0] + ball(12)
@@ -193,7 +193,7 @@ def test_in_a_scene_that_is_large_beside_its_distances_near_lies_before_what_pho
     assert (found.near[scene.view] < distance).mean() > 0.999
 
 
-def test_points_behind_or_beside_a_photo_or_unsure_ones_say_nothing_of_its_near() -> None:
+def test_unsure_or_unseen_points_do_not_set_near() -> None:
     scene = SCENES["around"]()
     centre, axis, right = scene.centres[0], scene.axes[0], scene.rights[0]
     jitter = 0.01 * ball(50)
@@ -220,7 +220,7 @@ def opaque_where(scene: Reconstruction, solid: np.ndarray) -> Reconstruction:
     return dataclasses.replace(scene, opaque=np.stack(boxes))
 
 
-def test_with_alpha_the_region_holds_what_is_opaque_where_only_a_spot_of_it_has_points() -> None:
+def test_with_alpha_the_region_holds_all_opaque_parts() -> None:
     bottle = ball(4000) * [0.3, 0.3, 1.0] + [0.0, 0.0, 0.2]
     scene = opaque_where(seen_by(ring(), 0.2 * ball()), bottle)
     found = normalise(scene, None)
@@ -228,7 +228,7 @@ def test_with_alpha_the_region_holds_what_is_opaque_where_only_a_spot_of_it_has_
     assert region_half(found) == pytest.approx(1.0, rel=0.15)
 
 
-def test_alpha_is_no_background_where_the_scene_goes_on_beyond_what_it_leaves() -> None:
+def test_alpha_is_no_background_where_the_scene_continues() -> None:
     thing = ball(4000)
     scene = opaque_where(seen_by(ring(), ball()), thing)
     few = normalise(with_points(scene, 20 * ball(3), views=16), None)  # wrong, half a percent of what is seen
@@ -241,7 +241,7 @@ def test_alpha_is_no_background_where_the_scene_goes_on_beyond_what_it_leaves() 
     np.testing.assert_array_equal(found.far, opaque.far)
 
 
-def test_alpha_is_no_background_where_the_region_asked_for_holds_a_part_of_what_it_leaves() -> None:
+def test_alpha_is_no_background_within_the_region_asked_for() -> None:
     scene = opaque_where(seen_by(ring(), ball()), ball(4000))
     part, whole = (normalise(scene, (0.0, 0.0, height, half)) for height, half in ((0.8, 0.35), (0.0, 1.1)))
     assert whole.bounded and whole.beyond_alpha == 0
@@ -250,7 +250,7 @@ def test_alpha_is_no_background_where_the_region_asked_for_holds_a_part_of_what_
     np.testing.assert_array_equal(part.far, unbounded.far)
 
 
-def test_a_photo_of_a_part_and_one_that_is_mistaken_carve_nothing_away() -> None:
+def test_partial_or_mistaken_photos_carve_nothing_away() -> None:
     thing = ball(4000)
     scene = opaque_where(seen_by(np.concatenate([ring(40), ring(2, radius=1.6)]), thing), thing)  # two see a part
     assert scene.opaque is not None
@@ -268,7 +268,7 @@ def test_photos_of_which_nothing_is_left_still_have_a_region() -> None:
 
 @pytest.mark.parametrize("has_alpha", [False, True])
 @pytest.mark.parametrize("away", [1.0, 30.0, 1e3, 1e6])
-def test_a_camera_anywhere_has_near_before_far_and_reaches_the_region(away: float, has_alpha: bool) -> None:
+def test_any_camera_has_near_before_far(away: float, has_alpha: bool) -> None:
     poses = ring()
     poses[0, :, 3] *= away
     cameras = dataclasses.replace(
@@ -292,7 +292,7 @@ def test_a_telephoto_lens_far_away_sees_the_region() -> None:
     assert (found.near < distance - 0.9).all() and (found.far > distance + 0.9).all()
 
 
-def test_a_view_of_nothing_but_the_far_distance_has_near_before_far() -> None:
+def test_a_view_of_the_distance_has_near_before_far() -> None:
     scene = with_points(seen_by(ring(), ball()), np.array([[0.0, 1e5, 0.0]]) + ball(50), 3)
     only_far = scene.point >= 400
     keep = (scene.view != 0) | only_far

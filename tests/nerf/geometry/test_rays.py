@@ -74,7 +74,7 @@ def test_agrees_with_the_slow_loop_and_stays_inside(origin: list[float], directi
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(-2, 2), min_size=6, max_size=6))
-def test_the_interval_in_any_box_is_where_dense_samples_are_inside(numbers: list[float]) -> None:
+def test_the_interval_in_a_box_matches_dense_samples(numbers: list[float]) -> None:
     if math.hypot(*numbers[3:]) < 1e-2:
         return
     low, high = torch.tensor([-0.9, -0.5, -0.2]), torch.tensor([0.9, 0.8, 1.1])
@@ -97,7 +97,7 @@ def test_rays_are_joined_one_after_the_other() -> None:
     assert beside.directions.tolist() == [[[0, 0, -1], [1, 0, 0]]] and beside.far.tolist() == [[10, 2]]
 
 
-def test_rays_of_a_view_start_at_its_centre_and_turn_with_it() -> None:
+def test_rays_start_at_the_view_and_turn_with_it() -> None:
     """A camera at (1, 2, 3) that looks along +x with +z up: x right is -y, y down is -z, z forward is +x."""
     pose = torch.tensor([[0.0, 0, 1, 1], [-1, 0, 0, 2], [0, -1, 0, 3]])
     rays = rays_of_view(torch.eye(3), pose, 0.5, 4.0)

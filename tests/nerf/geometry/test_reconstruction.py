@@ -43,7 +43,7 @@ def test_spatial_median_of_coinciding_points() -> None:
     np.testing.assert_array_equal(spatial_median(np.ones((5, 3))), np.ones(3))
 
 
-def test_lines_through_one_point_meet_there_whatever_a_third_of_them_does() -> None:
+def test_lines_meet_though_a_third_are_wrong() -> None:
     target = np.array([1.0, 2.0, 3.0])
     origins = random.normal(size=(30, 3)) * 5
     directions = target - origins

@@ -17,7 +17,7 @@ def rolled(poses: np.ndarray, degrees: np.ndarray) -> np.ndarray:
     return np.concatenate([poses[:, :, :3] @ turn, poses[:, :, 3:]], axis=2)
 
 
-def test_level_cameras_give_the_exact_up_even_when_all_look_down_from_one_side() -> None:
+def test_level_cameras_give_the_exact_up() -> None:
     up = find_up(seen_by(ring(arc_deg=100.0, height=4.0), ball()))
     assert up.known
     assert up.source in ("level horizons", "level standpoints")
@@ -48,7 +48,7 @@ def test_three_standpoints_always_share_a_plane_and_so_tell_nothing(third: tuple
     assert angles_deg(up.direction, UP) < 5
 
 
-def test_cameras_that_all_face_a_wall_take_up_from_their_upper_edges_and_not_from_their_plane() -> None:
+def test_wall_photos_take_up_from_their_upper_edges() -> None:
     up = find_up(seen_by(rolled(wall(), np.tile([-2.0, 2.0], 12)), ball()))
     assert up.source == "upper edges"
     assert angles_deg(up.direction, UP) < 1
@@ -84,7 +84,7 @@ def test_opposite_cameras_have_no_up_rather_than_nan() -> None:
 
 @pytest.mark.parametrize("turned", [90.0, -90.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_photos_all_around_that_lie_on_their_side_take_up_from_their_standpoints(turned: float, seed: int) -> None:
+def test_sideways_photos_all_around_take_up_from_their_centres(turned: float, seed: int) -> None:
     """Their upper edges cancel: the median of them is noise, and lies in the ring's plane."""
     random = np.random.default_rng(seed)
     poses = rolled(ring(count=24), turned + random.normal(0, 3, 24))
@@ -94,7 +94,7 @@ def test_photos_all_around_that_lie_on_their_side_take_up_from_their_standpoints
     assert 0 < angles_deg(up.direction, UP) < 5
 
 
-def test_photos_on_their_side_that_look_neither_down_nor_up_have_no_up() -> None:
+def test_sideways_level_photos_have_no_up() -> None:
     assert not find_up(seen_by(rolled(ring(height=0.1), np.full(16, 90.0)), ball())).known
 
 
@@ -105,7 +105,7 @@ def test_flights_to_and_fro_over_the_ground_know_up() -> None:
 
 
 @pytest.mark.parametrize(("error_m", "right"), [(0.5, True), (2.0, True), (6.0, False)])
-def test_places_tell_the_ground_from_a_wall_unless_they_are_too_far_off(error_m: float, right: bool) -> None:
+def test_gps_tells_ground_from_wall_unless_far_off(error_m: float, right: bool) -> None:
     """All photos are turned one way, in a frame of its own scale and turn; 60 m of flight to either side."""
     turn = nearest_rotations(np.random.default_rng(3).normal(size=(3, 3)))
     poses = survey(lines=7)
@@ -131,5 +131,5 @@ def test_the_more_certain_of_horizons_and_places_decides() -> None:
         assert find_up(scene, up_by_places(scene.centres, tilted, 0.05)).source == source
 
 
-def test_places_along_a_line_leave_open_how_the_scene_rolls_about_it() -> None:
+def test_gps_along_a_line_leaves_roll_open() -> None:
     assert up_by_places(np.linspace(0, 90, 10)[:, None] * [1.0, 2, 0], np.eye(4), 0.1).tilt > 1e9

@@ -122,7 +122,7 @@ def test_extreme_densities(backend: Backend, device: str, sigma: float) -> None:
 
 
 @BACKENDS
-def test_a_density_that_is_no_number_reaches_its_rays_depth_alone(backend: Backend, device: str) -> None:
+def test_nan_density_reaches_its_own_ray_alone(backend: Backend, device: str) -> None:
     samples = packed(device, [4, 4])
     sigma = torch.full((8,), 0.5)
     sigma[2] = math.nan

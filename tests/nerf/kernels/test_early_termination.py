@@ -123,7 +123,7 @@ def test_waves_are_packed_ray_by_ray_in_their_order(backend: Backend) -> None:
 
 
 @BACKENDS
-def test_one_wave_stays_as_it_is_and_none_of_its_rays_need_have_samples(backend: Backend) -> None:
+def test_one_round_stays_and_may_have_no_samples(backend: Backend) -> None:
     for counts in (COUNTS, (0, 0)):
         round = round_of(counts)
         samples, order = backend.pack_rounds([round])

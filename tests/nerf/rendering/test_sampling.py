@@ -30,7 +30,7 @@ def test_one_sample_in_every_bin_and_far_at_the_end(spacing: Spacing) -> None:
     assert share.std() > 0.25
 
 
-def test_without_a_generator_samples_stand_in_the_middle_of_their_bins() -> None:
+def test_without_a_generator_samples_are_bin_centres() -> None:
     assert stratified(*rays(1, 3, 1), 4, None)[0].tolist() == [1.25, 1.75, 2.25, 2.75, 3]
     assert stratified(*rays(1, 16, 1), 2, None, "log")[0].tolist() == pytest.approx([2, 8, 16])
 
@@ -124,6 +124,6 @@ def test_no_gradient_passes() -> None:
     assert not sample_pdf(torch.arange(5.0), weights, 3, None).requires_grad
 
 
-def test_a_chunk_of_rays_does_not_depend_on_the_others_without_randomness() -> None:
+def test_chunks_of_rays_are_independent() -> None:
     edges, weights = torch.sort(torch.rand(8, 5), -1).values, torch.rand(8, 4)
     assert torch.equal(sample_pdf(edges, weights, 7, None)[2:5], sample_pdf(edges[2:5], weights[2:5], 7, None))

@@ -106,7 +106,7 @@ def test_an_empty_interval_shows_the_background_and_reports_far() -> None:
     assert torch.isfinite(sigma.grad).all() and torch.isfinite(t.grad).all()
 
 
-def test_a_dense_interval_behind_a_thin_one_does_not_erase_it() -> None:
+def test_a_dense_interval_behind_a_thin_one_survives() -> None:
     weights, _ = volume_weights(torch.tensor([0.1, 1e30, 5.0]), torch.tensor([0.0, 1.0, 2.0, 3.0]))
     torch.testing.assert_close(weights, torch.tensor([1 - math.exp(-0.1), math.exp(-0.1), 0.0]))
 

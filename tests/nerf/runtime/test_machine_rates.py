@@ -10,7 +10,7 @@ from nerf.runtime.profiler import Profiler, WorkCounts
 CPU = torch.device("cpu")
 
 
-def test_rates_are_those_of_a_computer_and_no_random_state_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rates_are_plausible_and_keep_random_state(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine_rates, "STREAMED", 1 << 18)
     monkeypatch.setattr(machine_rates, "MIN_STREAMED", 1 << 16)
     monkeypatch.setattr(machine_rates, "GATHERED", 1 << 12)

@@ -49,14 +49,14 @@ def test_nothing_lies_between_the_camera_and_a_hit(scene: SyntheticScene):
         assert (scene.distance(points) > 0).all()
 
 
-def test_what_a_ray_sees_does_not_depend_on_near_and_far(scene: SyntheticScene):
+def test_a_ray_sees_the_same_whatever_near_and_far(scene: SyntheticScene):
     rays = view(1)
     other = scene.trace(Rays(rays.origins, rays.directions, 7 * rays.near, rays.far * math.inf))
     for a, b in zip(scene.trace(rays), other, strict=True):
         assert torch.equal(a, b)
 
 
-def test_colour_is_that_of_the_point_wherever_it_is_seen_from(scene: SyntheticScene):
+def test_colour_is_of_the_point_from_anywhere(scene: SyntheticScene):
     """Without a highlight two rays to one point see one colour; with it they do not."""
     points, normals = scene.surface_points(400, seed=1)
     aside = torch.nn.functional.normalize(points.roll(1, 0) - points, dim=-1)
@@ -75,7 +75,7 @@ def test_colour_is_that_of_the_point_wherever_it_is_seen_from(scene: SyntheticSc
     assert colours(scene._replace(highlight=1.0))[0].amax() > 0.1
 
 
-def test_rays_that_leave_the_surface_do_not_hit_where_they_start(scene: SyntheticScene):
+def test_rays_that_leave_a_surface_do_not_hit_it(scene: SyntheticScene):
     points, normals = scene.surface_points(2000, seed=2)
     others = torch.stack([solid.distance(points) for solid in scene.solids]).sort(0).values[1]
     free = others > 2e-3  # elsewhere two solids touch and the normal leads into the other one at once

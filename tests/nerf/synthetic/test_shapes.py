@@ -66,7 +66,7 @@ def test_the_first_entry_is_where_marching_first_gets_inside(name: str):
 
 
 @EVERY_SHAPE
-def test_rays_that_leave_the_surface_do_not_hit_where_they_start(name: str):
+def test_rays_that_leave_a_surface_do_not_hit_it(name: str):
     points, normals = surface(name, 2000)
     aside = torch.nn.functional.normalize(uniform(2000, 3) - 0.5, dim=-1)
     outward = torch.nn.functional.normalize(normals + 0.9 * aside, dim=-1)

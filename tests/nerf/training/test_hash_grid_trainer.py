@@ -95,7 +95,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
     assert same(states[0], states[1]) and same(states[0], states[2])
 
 
-def test_the_gradient_of_a_batch_is_the_sum_over_its_chunks() -> None:
+def test_a_batchs_gradient_is_the_sum_over_chunks() -> None:
     run = trainer(replace(TRAINER, samples=1 << 14, distortion=0.1, depth_loss=0.2, chunks=4))
     run.dataset = run.dataset.with_sparse_depths(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
     rays = run._rays_per_chunk()
@@ -217,7 +217,7 @@ def test_a_state_of_equal_shapes_but_other_settings_is_refused() -> None:
         trainer().load_state(other.state())
 
 
-def test_an_occupancy_grid_of_an_unbounded_scene_has_finite_steps_everywhere() -> None:
+def test_unbounded_occupancy_has_finite_steps() -> None:
     model = HashGridField(replace(FIELD, contracted=True), 0, reference)
     cache = HashGridTrainer(model, small_dataset(), TRAINER).occupancy_grid
     cache.update(15, torch.Generator().manual_seed(1))
@@ -364,7 +364,7 @@ def test_the_depth_loss_fades_in_value_and_gradient() -> None:
     assert pulls[0].any()
 
 
-def test_however_many_the_chunks_an_eighth_of_the_rays_run_to_points() -> None:
+def test_an_eighth_of_the_rays_run_to_points() -> None:
     run = trainer(replace(TRAINER, depth_loss=0.1))
     run.dataset = run.dataset.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
     for count in (1, 3, 5, 8, 21):
@@ -372,7 +372,7 @@ def test_however_many_the_chunks_an_eighth_of_the_rays_run_to_points() -> None:
         assert sum(to_points) == 32 * count // 8 and max(to_points) - min(to_points) <= 1
 
 
-def test_points_beyond_the_box_of_a_bounded_scene_are_no_guide() -> None:
+def test_points_beyond_a_bounded_box_are_no_guide() -> None:
     dataset = small_dataset().with_sparse_depths(torch.tensor([78, 78]), torch.tensor([3.0, 4.5]))
     outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1)
     for field, distances in {FIELD: [3.0], outdoors: [3.0, 4.5]}.items():
@@ -387,7 +387,7 @@ def test_without_a_weight_known_distances_change_nothing() -> None:
     assert same(plain.state(), other.state())
 
 
-def test_the_sky_where_it_is_always_hidden_falls_back_to_grey(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_always_hidden_background_turns_grey(monkeypatch: pytest.MonkeyPatch) -> None:
     """Light of a millionth reaches it now and then; Adam alone would follow that anywhere."""
     outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1, background_model=True)
     run = HashGridTrainer(

@@ -10,7 +10,7 @@ def test_small_errors_are_squared_and_large_ones_pull_no_harder() -> None:
     torch.testing.assert_close(pull, torch.tensor([0.05, -0.05, HUBER_DELTA, -HUBER_DELTA]))
 
 
-def test_the_pull_is_half_the_derivative_on_both_sides_of_the_bend() -> None:
+def test_huber_gradient_is_half_the_derivative() -> None:
     error = torch.linspace(-0.31, 0.3, 100, dtype=torch.float64, requires_grad=True)
     size = error.abs()
     torch.where(size < HUBER_DELTA, size**2, 2 * HUBER_DELTA * size - HUBER_DELTA**2).sum().backward()

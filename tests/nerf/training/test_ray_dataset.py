@@ -43,7 +43,7 @@ def test_the_fourth_channel_is_alpha() -> None:
     assert torch.equal(colours, photos[0].flatten(0, 1)[[0, 7], :3].float() / 255)
 
 
-def test_samples_are_uniform_over_pixels_whatever_the_sizes_of_the_photos() -> None:
+def test_samples_are_uniform_over_pixels() -> None:
     dataset, *_ = scattered()
     count = 38_000  # a thousand for each of the 38 pixels
     near = dataset.lookup(dataset.draw(count, generator("cpu", 0))).rays.near
@@ -58,7 +58,7 @@ def test_samples_depend_on_the_generator_alone() -> None:
     assert torch.equal(first, second) and not torch.equal(first, other)
 
 
-def test_a_photo_with_fewer_pixels_than_its_camera_has_bearings_is_refused() -> None:
+def test_a_photo_smaller_than_its_camera_is_refused() -> None:
     photo, directions = torch.zeros(2, 3, 3, dtype=torch.uint8), torch.zeros(3, 2, 3)
     with pytest.raises(ValueError, match=r"photo 0 has size \(2, 3\), its camera 0 \(3, 2\) directions"):
         ray_dataset_from_images([photo], [0], [directions], torch.zeros(1, 3, 4), torch.ones(1), torch.ones(1))
@@ -171,7 +171,7 @@ def test_without_masks_the_same_pixels_are_drawn_as_ever() -> None:
     assert torch.equal(dataset.nth(pixel), pixel) and dataset.to("cpu").runs is None
 
 
-def test_known_distances_are_drawn_with_their_pixels_as_often_as_each_other() -> None:
+def test_pixels_with_depth_are_sampled_as_often() -> None:
     dataset, *_ = scattered()
     assert dataset.known is None and dataset.with_sparse_depths(torch.zeros(0).long(), torch.zeros(0)).known is None
     known = dataset.with_sparse_depths(torch.tensor([3, 30, 3]), torch.tensor([1.5, 4.5, 3.5]))
@@ -184,7 +184,7 @@ def test_known_distances_are_drawn_with_their_pixels_as_often_as_each_other() ->
     assert torch.equal(known.draw(50, generator("cpu", 1)), dataset.draw(50, generator("cpu", 1)))
 
 
-def test_how_far_away_views_look_is_the_median_of_what_they_are_known_to_show() -> None:
+def test_viewing_distance_is_the_median_of_known_depths() -> None:
     dataset, *_ = scattered()
     assert dataset.viewing_distance is None
     known = dataset.with_sparse_depths(torch.tensor([30, 3, 37, 4, 23]), torch.tensor([4.5, 3.0, 5.0, 1.5, 3.25]))

@@ -34,7 +34,7 @@ def test_a_decision_leaves_the_past_and_the_present_alone(plan: StepSchedule, mo
 
 
 @given(plans(), st.integers(0, 60))
-def test_a_plan_without_its_later_decisions_is_the_one_that_held(plan: StepSchedule, step: int) -> None:
+def test_a_schedule_without_later_revisions_is_the_earlier_one(plan: StepSchedule, step: int) -> None:
     earlier = plan.until(step)
     assert [earlier.progress(s) for s in range(step + 1)] == [plan.progress(s) for s in range(step + 1)]
     assert earlier.decisions[-1].from_step <= step and plan.decisions[: len(earlier.decisions)] == earlier.decisions
@@ -50,7 +50,7 @@ def test_half_way_through_twice_the_steps() -> None:
 
 
 @given(plans(), st.integers(1, 60), st.integers(1, 60))
-def test_more_steps_take_the_share_back_to_that_of_the_longer_run(plan: StepSchedule, more: int, yet_more: int) -> None:
+def test_more_steps_take_progress_back(plan: StepSchedule, more: int, yet_more: int) -> None:
     done = plan.total_steps
     longer = plan.extended(done + more)
     assert [longer.progress(step) for step in range(done)] == [plan.progress(step) for step in range(done)]
@@ -73,7 +73,7 @@ def test_a_run_that_closes_early_ends_as_every_run_does(total: int, data: st.Dat
         assert closed.progress(step) == pytest.approx(whole.progress(step), abs=0.05)
 
 
-def test_a_run_may_end_at_any_step_it_has_come_to() -> None:
+def test_a_run_may_end_at_any_step() -> None:
     ended = schedule_of(10).closing(6).ended(7)
     assert ended.total_steps == 7 and ended.progress(7) == schedule_of(10).closing(6).progress(7)
     with pytest.raises(ValueError, match="cannot end"):
@@ -111,14 +111,14 @@ def test_a_run_on_a_steady_clock_ends_on_time(budget: float, rate: float) -> Non
     assert len(plan.decisions) <= 2
 
 
-def test_a_run_that_turns_out_slow_is_cut_short_and_still_ends_at_1() -> None:
+def test_a_slow_run_is_cut_short_and_ends_at_1() -> None:
     plan = replanned(schedule_of(100), 50, 9.0, 10.0, 10.0, 0.1)
     assert plan.total_steps == 60
     assert plan.progress(49) == 0.49 and plan.progress(50) == 0.9
     assert plan.progress(60) == pytest.approx(1)
 
 
-def test_a_plan_made_too_short_leaves_no_trace_in_the_rates() -> None:
+def test_a_schedule_made_too_short_leaves_no_trace() -> None:
     plan = replanned(schedule_of(30), 29, 1.5, 30.0, 20.0, 0.3)
     assert plan.total_steps == 29 + 570
     assert plan.progress(29) == 0.05

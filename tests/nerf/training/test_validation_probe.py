@@ -97,7 +97,7 @@ def test_a_picture_is_as_bright_as_a_photo_can_be() -> None:
     assert (shown == 1).all()
 
 
-def test_a_score_is_of_colours_as_bright_as_a_photo_can_be() -> None:
+def test_scores_clamp_colours_like_a_photo() -> None:
     too_bright, white = (
         measure(Painted(), make_probe(two_photos(grey), 50, torch.zeros(3), seed=0)).psnr for grey in (1.5, 1.0)
     )

@@ -81,7 +81,7 @@ def test_training_beats_a_flat_colour() -> None:
     assert probe.mean_colour_psnr + 3 < measure(run.model, probe).psnr < 60
 
 
-def test_the_loss_is_the_sum_of_both_renderings_mean_squared_errors() -> None:
+def test_the_loss_sums_both_renderings_errors() -> None:
     run = trainer()
     nothing = replace(FIELD, hierarchical=False)
     alone = VanillaTrainer(VanillaNerf(nothing, seed=0), small_dataset(), TRAINER).step(0, 0.0)
@@ -121,7 +121,7 @@ def test_the_rate_scale_scales_the_update() -> None:
         torch.testing.assert_close(moved_half, moved / 2, atol=1e-6, rtol=1e-3)
 
 
-def test_a_random_background_is_new_in_every_step_and_shines_through_alpha() -> None:
+def test_a_random_background_is_new_each_step() -> None:
     run = trainer(replace(TRAINER, background="random"), small_dataset(channels=4))
     seen = []
     forward = run.model.render_training

@@ -92,9 +92,7 @@ def test_a_config_file_is_validated(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert message in capsys.readouterr().err
 
 
-def test_match_exposure_is_an_option_of_render_whichever_way_it_is_spelt(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_match_exposure_belongs_to_render_however_spelt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     seen: list[str | None] = []
     monkeypatch.setattr(
         "pipeline.cli.commands._run_stages",
@@ -107,7 +105,7 @@ def test_match_exposure_is_an_option_of_render_whichever_way_it_is_spelt(
     assert seen == ["a.jpg", "a.jpg", None]
 
 
-def test_a_target_is_an_option_of_train_whichever_way_it_is_spelt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_target_belongs_to_train_however_spelt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     seen: list[float | None] = []
     monkeypatch.setattr(
         "pipeline.cli.commands._run_stages", lambda root, settings, *_, **__: seen.append(settings.train.target_psnr)
@@ -256,7 +254,7 @@ def test_until_ingest_then_status_and_explain_and_clean(tmp_path: Path, capsys: 
     assert "0.0 MB in 0 folders" in capsys.readouterr().out
 
 
-def test_a_budget_is_said_to_be_spent_by_a_run_and_not_by_a_stage(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_budgets_are_spent_by_runs_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "photos").mkdir()
     for k in range(3):
         Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")
@@ -306,7 +304,7 @@ def test_what_lies_beside_known_cameras_changes_nothing(tmp_path: Path, capsys: 
     assert "one camera" in run_on(tmp_path / "photos", capsys, "--until", "ingest")[1]
 
 
-def test_photos_that_cannot_be_used_any_more_fail_their_own_stage(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_photos_now_unusable_fail_their_own_stage(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "photos").mkdir()
     for k in range(3):
         Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")
@@ -317,7 +315,7 @@ def test_photos_that_cannot_be_used_any_more_fail_their_own_stage(tmp_path: Path
     assert f"no photos in {tmp_path / 'photos'}" in capsys.readouterr().err
 
 
-def test_a_photo_that_cannot_be_read_any_more_fails_the_stage_that_reads_it(
+def test_a_photo_now_unreadable_fails_its_reader(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     (tmp_path / "photos").mkdir()

@@ -38,7 +38,7 @@ def steps_of(workspace: str) -> int:
     return json.loads((result(workspace) / "field.json").read_text())["steps"]
 
 
-def test_more_has_a_folder_of_its_own_and_a_chain_of_them(trained, monkeypatch: pytest.MonkeyPatch):
+def test_more_chains_folders_of_its_own(trained, monkeypatch: pytest.MonkeyPatch):
     photos, workspace = trained
     first, before = result(workspace), (result(workspace) / "manifest.json").read_bytes()
     assert run_command(["run", photos, "-o", workspace, "--until", "train", "--more", "8steps"]) == 0

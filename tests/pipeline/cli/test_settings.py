@@ -97,7 +97,7 @@ def test_the_field_given_takes_back_the_options_of_the_other(remembered: dict, w
         ({"path": "spiral"}, ["--render.frames", "40"], {"path": "spiral", "frames": 40}),
     ],
 )
-def test_a_path_or_cameras_given_take_the_place_of_what_is_remembered(remembered: dict, words: list[str], left: dict):
+def test_a_given_path_or_camera_file_replaces_the_remembered(remembered: dict, words: list[str], left: dict):
     asked = parse(StageArguments, "render", ["w", *words], Settings(render=RenderConfig(**remembered)))
     assert asked.settings.render == RenderConfig(**left)
 
@@ -107,7 +107,7 @@ def test_known_cameras_of_the_photos_leave_a_path_to_render():
     assert parse(RunArguments, "run", ["photos", "--cameras", "my.json"], in_file).settings == in_file
 
 
-def test_a_file_may_begin_with_the_byte_order_mark_of_windows(tmp_path: Path):
+def test_a_file_may_begin_with_a_byte_order_mark(tmp_path: Path):
     (tmp_path / "a.toml").write_bytes(b"\xef\xbb\xbf[train]\r\nsteps = 3\r\n")
     assert read_toml(tmp_path / "a.toml") == {"train": {"steps": 3}}
 
@@ -136,7 +136,7 @@ def test_a_workspace_beside_its_photos_is_one(tmp_path: Path, capsys: pytest.Cap
     assert "is a workspace" in capsys.readouterr().err
 
 
-def test_a_workspace_nobody_named_is_not_taken_over_by_other_photos(
+def test_unnamed_workspaces_are_not_shared_by_photo_sets(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     for k, scan in enumerate(("scan1", "scan2")):
@@ -175,7 +175,7 @@ def test_photos_given_one_by_one_are_told_from_wrong_options(
     assert said == "pipeline: b.jpg is one file too many; give the folder that holds the photos\n"
 
 
-def test_poses_that_no_field_will_fit_are_refused_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_poses_no_field_can_fit_are_refused_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "photos").mkdir()
     Image.new("RGB", (40, 30)).save(tmp_path / "photos/a.jpg")
     words = ["run", str(tmp_path / "photos"), "-o", str(tmp_path / "w"), "--evaluate.fit-poses", "on"]

@@ -26,7 +26,7 @@ def few_small_photos(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo, "LENS", TINY)
 
 
-def test_photos_are_made_once_and_made_again_when_one_is_missing(tmp_path: Path, progress):
+def test_photos_are_remade_when_one_is_missing(tmp_path: Path, progress):
     photos = tmp_path / "photos"
     line, seconds = demo.photograph(photos, progress)
     assert line == "3 photos 48×36 of a still life, every camera and surface known"

@@ -87,7 +87,7 @@ def write_mesh(folder: Path, level: float) -> None:
     trimesh.Trimesh(vertices, faces, process=False).export(folder / "mesh.ply")
 
 
-def test_the_distance_of_meshes_is_measured_in_percent_of_the_table(tmp_path: Path):
+def test_mesh_distance_is_in_percent_of_the_table(tmp_path: Path):
     truth = truth_of(12)
     write_output(tmp_path, dict(truth.poses))
     write_mesh(tmp_path, 0.0)
@@ -102,7 +102,7 @@ def test_the_distance_of_meshes_is_measured_in_percent_of_the_table(tmp_path: Pa
     assert thick.chamfer == pytest.approx((thick.accuracy + thick.completeness) / 2)
 
 
-def test_only_what_faces_a_camera_with_nothing_in_between_is_seen():
+def test_only_unoccluded_faces_are_seen():
     scene = still_life()
     points, normals = scene.surface_points(4000, seed=0)
     above = torch.tensor([[0.0, 0.0, 4.0]])

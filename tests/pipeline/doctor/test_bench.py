@@ -43,9 +43,7 @@ def test_it_is_measured_only_if_asked_for(quick: None, capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize("space", ["bounded", "contracted"])
-def test_the_optimiser_is_shared_by_as_many_rays_as_a_step_has_on_this_machine(
-    space: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_optimisers_share_follows_the_rays_per_step(space: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stages.train.fields.hash_grid.compute_device", lambda: "cpu")
     works = []
     for count in (1, 4):

@@ -29,7 +29,7 @@ def test_without_warp_torch_alone_is_measured(monkeypatch, capsys: pytest.Captur
     assert " torch " in (out := capsys.readouterr().out) and " warp " not in out
 
 
-def test_what_is_off_is_said_and_the_program_ends_with_one(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failed_selftest_is_told_and_exits_with_one(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
     case = next(case for case in CASES if "contraction" in case.formula)
     off = case._replace(function=lambda backend, x: case.function(backend, x) * 1.001)
     monkeypatch.setattr(matrix, "CASES", [case, off])
@@ -54,7 +54,7 @@ def test_the_matrix_is_measured_only_if_asked_for(monkeypatch, capsys: pytest.Ca
 @pytest.mark.parametrize(
     "why, line", [(None, "hash-grid field: warp"), ("it is old", "hash-grid field: torch, because it is old")]
 )
-def test_the_kernels_of_the_grid_field_are_those_that_train_would_choose(why, line, monkeypatch, capsys) -> None:
+def test_doctor_names_the_kernels_that_train_would_choose(why, line, monkeypatch, capsys) -> None:
     monkeypatch.setattr(doctor, "self_test", lambda device: [])
     monkeypatch.setattr(doctor, "why_not_warp", lambda device: why)
     assert commands.run_command(["doctor"]) == 0

@@ -17,7 +17,7 @@ from tests.pipeline.schedule.made_up_machine import Machine, Options, runs_on
 from tests.refusals import refused
 
 
-def test_cameras_of_a_video_that_are_gone_stop_the_video_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_render_cameras_stop_the_video_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go, machine, path = runs_on(tmp_path, monkeypatch), Machine(), tmp_path / "path.json"
     path.write_text("{}")
     options: dict[str, Any] = {"render": {"cameras": path}}
@@ -34,9 +34,7 @@ def test_cameras_of_a_video_that_are_gone_stop_the_video_alone(tmp_path: Path, m
         go(machine, 300.0, **options)
 
 
-def test_without_the_photos_and_their_digest_no_report_is_made_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_report_without_photos_and_their_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go = runs_on(tmp_path, monkeypatch)
     go(Machine(), 300.0)
     monkeypatch.setattr(
@@ -48,7 +46,7 @@ def test_without_the_photos_and_their_digest_no_report_is_made_up(
 
 
 @pytest.mark.parametrize("words", [["--render.cameras", "my.json"], ["--config", "options.toml"]], ids=["flag", "file"])
-def test_cameras_to_render_have_to_be_there_and_are_found_from_everywhere(
+def test_render_cameras_must_exist_and_are_found_from_anywhere(
     words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "photos").mkdir()

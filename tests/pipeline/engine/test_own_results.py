@@ -95,7 +95,7 @@ def test_links_of_the_user_s_own_are_recorded_as_given(workspace: Path, photos: 
     assert seen[0].sfm.cameras == tmp_path / "mine.json" and seen[0].ingest.photos == tmp_path / "link"
 
 
-def test_where_links_are_not_allowed_a_copy_stands_for_what_it_shows(workspace: Path):
+def test_copies_replace_links_where_links_are_forbidden(workspace: Path):
     shown, stays = workspace / "output/path.json", workspace / "render" / KEY / "path.json"
     shown.unlink()
     shutil.copy(stays, shown)
@@ -131,7 +131,7 @@ def test_what_the_options_name_inside_goes_with_a_moved_workspace(workspace: Pat
     assert (moved / "sfm" / KEY / "sparse/images.bin").exists() and not (moved / "normalise" / KEY).exists()
 
 
-def test_a_budget_is_of_the_same_options_in_a_moved_workspace(tmp_path: Path):
+def test_a_moved_workspace_keeps_its_budget(tmp_path: Path):
     def of_options(root: Path) -> str:
         settings = Settings(sfm=SfmConfig(cameras=root / "sfm" / KEY / "sparse"))
         return Runner(Workspace(root), settings, SilentDisplay())._options_digest()

@@ -45,13 +45,13 @@ def test_an_emptied_folder_is_like_none(photos: Path, tmp_path: Path):
     assert links(tmp_path) == before
 
 
-def test_photos_that_were_never_ingested_are_missed_in_an_empty_folder(photos: Path, tmp_path: Path):
+def test_uningested_photos_are_missed_in_an_empty_folder(photos: Path, tmp_path: Path):
     (tmp_path / "other/photos").mkdir(parents=True)
     with pytest.raises(StageFailed, match="is empty"):
         run(tmp_path / "other/photos")
 
 
-def test_what_was_finished_stays_in_output_where_the_photos_cannot_be_used(photos: Path, tmp_path: Path):
+def test_finished_output_stays_where_photos_are_unusable(photos: Path, tmp_path: Path):
     before = links(tmp_path)
     (photos / "0.png").rename(photos / "notes.txt")
     with pytest.raises(StageFailed, match="no photos in"):

@@ -40,9 +40,7 @@ def bring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bring:
     return go
 
 
-def test_what_is_part_of_no_key_can_be_changed_after_it_was_planned(
-    bring: Bring, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unhashed_options_change_after_planning(bring: Bring, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a longer --sfm.max-seconds, once a shorter one was not enough."""
     monkeypatch.setattr(fake_stages.STAGES["sfm"], "NOT_HASHED", ("fail",), raising=False)
     with pytest.raises(StageFailed):
@@ -72,7 +70,7 @@ def test_only_the_plans_of_the_stages_named_are_made_anew(bring: Bring, tmp_path
     assert Workspace(tmp_path / "w.nerf").read_run().plans == run.plans
 
 
-def test_status_says_why_a_stage_is_stale_whose_plan_is_still_to_be_made(
+def test_status_explains_stale_stages_without_a_plan(
     bring: Bring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pipeline.engine.status.STAGES", fake_stages.STAGES)

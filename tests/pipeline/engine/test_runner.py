@@ -76,7 +76,7 @@ def test_only_what_changed_runs_again(bring: Bring):
     assert calls == ["plan sfm", "sfm", "train"]
 
 
-def test_a_new_or_changed_mask_is_a_change_of_the_photos(bring: Bring, photos: Path):
+def test_a_changed_mask_changes_the_photos(bring: Bring, photos: Path):
     bring()
     (photos / "masks").mkdir()
     for level in (0, 255):
@@ -111,7 +111,7 @@ def test_equal_upstream_bytes_leave_downstream_cached(bring: Bring):
     assert calls == ["ingest"]
 
 
-def test_photos_enter_by_name_and_content_not_by_place_or_time(bring: Bring, photos: Path):
+def test_photos_are_keyed_by_name_and_content(bring: Bring, photos: Path):
     bring()
     os.utime(photos / "0.png")
     assert bring() is False
@@ -162,16 +162,14 @@ def test_a_kill_between_manifest_and_rename_loses_nothing(bring: Bring, tmp_path
     assert sorted(p.name for p in folder.iterdir()) == ["manifest.json", "result.json"]
 
 
-def test_options_that_cannot_change_the_result_do_not_run_it_again(bring: Bring, monkeypatch: pytest.MonkeyPatch):
+def test_unhashed_options_do_not_run_a_stage_again(bring: Bring, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(fake_stages.STAGES["train"], "NOT_HASHED", ("die_at",), raising=False)
     bring()
     bring(train={"die_at": 99})
     assert calls == []
 
 
-def test_what_a_stage_reads_where_it_is_there_neither_runs_for_it_nor_makes_it_stale(
-    bring: Bring, monkeypatch: pytest.MonkeyPatch
-):
+def test_optional_inputs_neither_run_nor_make_stale(bring: Bring, monkeypatch: pytest.MonkeyPatch):
     train, seen = fake_stages.STAGES["train"], list[set[str]]()
     whole = train.run
     monkeypatch.setattr(train, "INPUTS", ("ingest",))
@@ -187,9 +185,7 @@ def test_what_a_stage_reads_where_it_is_there_neither_runs_for_it_nor_makes_it_s
     assert seen[1:] == [{"ingest", "sfm"}]
 
 
-def test_a_damaged_input_that_is_only_read_where_it_is_there_is_left_out_and_left_in_place(
-    bring: Bring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_damaged_optional_inputs_are_left_out_in_place(bring: Bring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     train, seen, notes = fake_stages.STAGES["train"], list[set[str]](), list[str]()
     whole = train.run
     monkeypatch.setattr(train, "INPUTS", ("ingest",))

@@ -43,7 +43,7 @@ def manifest(tmp_path: Path, stage: str) -> dict[str, Any]:
     return read_json(path)
 
 
-def test_a_run_that_a_stage_refused_is_over_and_the_next_has_its_whole_budget(go: Go) -> None:
+def test_a_refused_run_ends_and_the_next_is_whole(go: Go) -> None:
     machine = Machine()
     machine.refuses = "sfm"
     with pytest.raises(StageFailed):
@@ -73,7 +73,7 @@ def test_a_study_is_no_part_of_a_run(go: Go, tmp_path: Path) -> None:
     assert not go(machine, 300.0).ran
 
 
-def test_a_study_between_a_kill_and_a_resume_leaves_what_was_left(go: Go) -> None:
+def test_a_study_between_kill_and_resume_leaves_the_rest(go: Go) -> None:
     machine = Machine()
     machine.killed_at = [machine.now + 100]
     with pytest.raises(Killed):
@@ -95,7 +95,7 @@ def test_a_report_alone_keeps_the_account_of_the_run(go: Go, tmp_path: Path) -> 
     assert not go(machine, 300.0).ran and reported(tmp_path) == before
 
 
-def test_a_stage_alone_after_a_run_keeps_the_account_of_the_run(go: Go, tmp_path: Path) -> None:
+def test_a_stage_alone_keeps_the_runs_account(go: Go, tmp_path: Path) -> None:
     machine = Machine()
     go(machine, 300.0)
     before = reported(tmp_path)
@@ -131,7 +131,7 @@ def test_more_is_charged_to_no_budget_also_after_a_kill(go: Go, alone: bool) -> 
     assert all(seconds > 0.3 * 300 for seconds in account["allocated"].values())
 
 
-def test_what_planning_takes_is_part_of_the_time_of_a_stage(go: Go, tmp_path: Path) -> None:
+def test_planning_counts_as_time_of_its_stage(go: Go, tmp_path: Path) -> None:
     runner = go(Machine(), 300.0)
     for stage in ("evaluate", "render", "mesh"):
         assert manifest(tmp_path, stage)["seconds"] == pytest.approx(spent(runner)[stage], abs=0.1)

@@ -72,7 +72,7 @@ def test_what_later_stages_have_no_use_for_goes_to_training() -> None:
     assert hours == pytest.approx(36000 - sum(FLEXIBLE[name].max_seconds for name in FLEXIBLE if name != "train"))
 
 
-def test_cached_stages_cost_nothing_but_a_video_does_not_grow_to_fill_an_hour() -> None:
+def test_cached_stages_cost_nothing_and_videos_stay_short() -> None:
     assert allocated("render", 3600.0, {"mesh": None, "report": 2.0}, 3600.0) == pytest.approx(0.35 * 3600)
 
 
@@ -124,13 +124,13 @@ def test_a_machine_that_becomes_half_as_fast_midway_is_met(go: Go, when: float) 
     assert go(machine, 300.0).took == pytest.approx(300, rel=0.2)
 
 
-def test_a_budget_too_small_for_the_cameras_makes_the_least_of_the_rest(go: Go) -> None:
+def test_a_budget_too_small_leaves_the_least_for_each(go: Go) -> None:
     runner = go(Machine(), 45.0)
     assert runner.took < 45 + sum(MIN_SECONDS.values()) + 5
     assert spent(runner)["train"] < MIN_SECONDS["train"] + 5
 
 
-def test_the_same_again_is_nothing_to_do_and_another_budget_loses_nothing(go: Go, tmp_path: Path) -> None:
+def test_the_same_budget_again_has_nothing_to_do(go: Go, tmp_path: Path) -> None:
     machine = Machine()
     go(machine, 120.0)
     folders = {path for path in (tmp_path / "w.nerf").glob("*/*") if path.is_dir()}
@@ -144,7 +144,7 @@ def test_the_same_again_is_nothing_to_do_and_another_budget_loses_nothing(go: Go
     assert not back.ran or set(spent(back)) == {"report"}
 
 
-def test_without_a_budget_again_its_choices_are_forgotten_but_not_lost(go: Go) -> None:
+def test_without_the_budget_its_choices_are_forgotten(go: Go) -> None:
     given = {name: {"seconds": 5.0} for name in FLEXIBLE}
     machine = Machine()
     go(machine, 120.0)
@@ -158,7 +158,7 @@ def given_to_pilots(workspace: Path) -> list[float | None]:
     return sorted(read_json(file)["config"]["seconds"] for file in workspace.glob("effects/*/result.json"))
 
 
-def test_without_a_budget_pilots_have_their_part_of_the_usual_run(go: Go, tmp_path: Path) -> None:
+def test_pilots_have_their_part_of_a_usual_run(go: Go, tmp_path: Path) -> None:
     others = {name: {"seconds": 5.0} for name in ("evaluate", "render", "mesh")}
     times = EXPECTED | dict.fromkeys(others, 5.0) | {"train": 204.0}
     total = sum(seconds or 0.0 for seconds in times.values())
@@ -195,7 +195,7 @@ def test_a_kill_and_a_resume_keep_the_total(go: Go, kills: list[float]) -> None:
     assert sum(spent(runner).values()) == pytest.approx(worked + runner.took, abs=1 + BEAT * len(kills))
 
 
-def test_what_a_kill_took_with_it_is_not_told_by_the_times_of_files(go: Go, tmp_path: Path) -> None:
+def test_a_kills_loss_is_not_told_by_file_times(go: Go, tmp_path: Path) -> None:
     """As after a copy, or after a clock that was put forward."""
     machine = Machine()
     machine.killed_at = [machine.now + 100]
@@ -227,7 +227,7 @@ def test_other_options_are_another_run_with_its_whole_budget(go: Go) -> None:
     assert other.took == pytest.approx(300, rel=0.1)
 
 
-def test_seconds_given_to_a_stage_win_and_the_rest_fits_around_it(go: Go) -> None:
+def test_given_seconds_win_and_the_rest_fits(go: Go) -> None:
     machine = Machine()
     runner = go(machine, 300.0, evaluate={"seconds": 4.0}, train={"seconds": 100.0})
     assert spent(runner)["train"] == pytest.approx(104, abs=3)
@@ -243,7 +243,7 @@ def test_one_stage_alone_has_a_share_and_not_the_whole(go: Go) -> None:
     assert 40 < spent(runner)["render"] < 0.4 * 300
 
 
-def test_what_is_made_again_for_a_report_is_planned_though_nobody_asked_for_it(go: Go, tmp_path: Path) -> None:
+def test_remakes_for_a_report_are_planned(go: Go, tmp_path: Path) -> None:
     machine = Machine()
     go(machine, 300.0)
     (report,) = (tmp_path / "w.nerf/report").iterdir()

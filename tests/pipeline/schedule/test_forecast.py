@@ -75,7 +75,7 @@ def test_of_a_video_its_length_and_size_tell(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("set_of", "measured"), [(Photos(50, 2.1), 37.6), (Photos(11, 1.6), 17.1), (Photos(20, 0.76), 43)]
 )
-def test_structure_from_motion_is_expected_within_a_factor_of_two_and_a_half(set_of: Photos, measured: float) -> None:
+def test_expected_sfm_time_is_roughly_right(set_of: Photos, measured: float) -> None:
     """fox, fountain_p11 and fern on two idle cores."""
     assert measured / 2.5 < sfm_seconds(set_of, 2) < 2.5 * measured
     assert sfm_seconds(set_of, 16) < sfm_seconds(set_of, 2)
@@ -136,7 +136,7 @@ def pilots_seconds(given: Settings, times: dict[str, float | None], reading: flo
     return limited_seconds(STAGES, "effects", {name: getattr(given, name) for name in STAGES}, times, reading)
 
 
-def test_pilots_have_a_limit_where_the_time_of_the_run_is_known() -> None:
+def test_pilots_have_a_limit_where_time_is_known() -> None:
     times, reading = expected_times(STAGES, workload(Settings(), Photos(50, 2.0)), budgeted=False), 2.0
     total = sum(seconds or 0.0 for seconds in times.values())
     seconds = pilots_seconds(Settings(), times, reading)
@@ -204,14 +204,12 @@ def test_more_is_expected_by_what_comes_on_top(
         ({"steps": 500}, []),
     ],
 )
-def test_a_training_that_ends_by_itself_is_not_said_ofd_within_the_workspaces_budget(
-    said_of: SaidOf, train: dict[str, Any], words: list[str]
-) -> None:
+def test_a_training_that_ends_itself_is_not_budgeted(said_of: SaidOf, train: dict[str, Any], words: list[str]) -> None:
     names = (*BEFORE_TRAINING, "train", "report")
     assert said_of(120.0, done=BEFORE_TRAINING, names=names, train=train) == words
 
 
-def test_what_follows_more_is_given_by_the_budget_and_more_beside_it(said_of: SaidOf) -> None:
+def test_what_follows_more_is_budgeted_and_more_is_not(said_of: SaidOf) -> None:
     given: dict[str, Any] = {"train": {"after": "there", "more_seconds": 600.0}, "done": BEFORE_TRAINING}
     end = time.strftime("%H:%M", time.localtime(NOW + 606 + 300))
     assert said_of(300.0, **given) == [f"budget 5 min and 10 min on top, done at {end} at the latest"]
@@ -227,14 +225,14 @@ def test_a_study_is_expected_with_what_it_needs(said_of: SaidOf) -> None:
     assert words.startswith("budget 5 min and 30 min on top, done at ")
 
 
-def test_more_takes_what_was_asked_for_and_what_comes_with_it() -> None:
+def test_more_takes_what_it_needs() -> None:
     given: dict[str, Any] = {"train": {"after": "there", "more_seconds": 600.0, "seconds": 30.0}}
     assert expected(Settings.model_validate(given), Photos(50, 0.75))["train"] == pytest.approx(604.75)
     given["train"] |= {"more_seconds": None, "more_steps": 9}
     assert expected(Settings.model_validate(given), Photos(50, 0.75))["train"] is None
 
 
-def test_a_budget_is_given_with_its_end_or_said_to_be_too_short(said_of: SaidOf) -> None:
+def test_a_budget_tells_its_end_or_its_lack(said_of: SaidOf) -> None:
     (words,) = said_of(600.0)
     assert words.startswith("budget 10 min, done at about ") and words[-3] == ":"
     (words,) = said_of(30.0)
@@ -242,7 +240,7 @@ def test_a_budget_is_given_with_its_end_or_said_to_be_too_short(said_of: SaidOf)
     assert words.endswith(" is the least that would do; all is made as small as can be")
 
 
-def test_what_earlier_attempts_took_is_told_apart_from_a_budget_too_small_for_the_photos(said_of: SaidOf) -> None:
+def test_earlier_attempts_are_told_apart_from_small_budgets(said_of: SaidOf) -> None:
     (words,) = said_of(300.0, before=240.0)
     assert words.startswith("budget 5 min, 1 min of it left by what was spent before; about ")
     assert words.endswith(" is needed: give a larger --budget, or all is made as small as can be")
@@ -261,7 +259,7 @@ def test_no_end_is_given_that_only_a_training_would_need(said_of: SaidOf) -> Non
 # --- reading the photos
 
 
-def test_large_photos_are_read_by_every_stage_that_looks_at_all_of_them() -> None:
+def test_large_photos_cost_each_stage_that_reads_all() -> None:
     small, large, given = Photos(200, 1.7), Photos(200, 24.0), Settings.model_validate({"train": {"seconds": 60.0}})
     before, after = expected(given, small), expected(given, large)
     more = {stage: (after[stage] or 0) - (before[stage] or 0) for stage in before}

@@ -36,7 +36,7 @@ def listed() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("listed")
-def test_an_effect_is_its_own_file_and_one_entry_of_the_list(tmp_path: Path) -> None:
+def test_an_effect_is_one_file_and_one_entry(tmp_path: Path) -> None:
     inputs = effect_scene(tmp_path / "scene", Effects(exposure_ev=1.0, alpha=True), views=10)
     config = with_effects(Settings(), ["falloff=on", "exposure=on"]).effects.model_copy(update={"pilots": 0})
     (out := tmp_path / "effects").mkdir()

@@ -89,9 +89,7 @@ def test_clear_evidence_decides_without_a_pilot(decided: Callable) -> None:
 
 
 @pytest.mark.parametrize(("gain", "on"), [(0.3, True), (0.15, False), (-1.0, False)])
-def test_a_pilot_decides_in_the_grey_zone_by_its_gain_against_its_noise(
-    decided: Callable, gain: float, on: bool
-) -> None:
+def test_a_pilot_decides_by_gain_against_noise(decided: Callable, gain: float, on: bool) -> None:
     decisions, table, _, tried = decided(effects.Config(), gain, exposure=found(None))
     assert tried == ["exposure"] and ("exposure" in decisions.on) is on
     assert (table["exposure"]["pilot_gain_db"], table["exposure"]["seconds"]) == (gain, 3.25)
@@ -113,7 +111,7 @@ def test_gains_go_to_training_by_the_names_of_its_photos(decided: Callable) -> N
     assert all(gain == [0.5] * 3 for gain in decisions.on["exposure"].values())
 
 
-def test_poses_that_are_clearly_wrong_are_refined_without_a_pilot_which_would_be_too_short(decided: Callable) -> None:
+def test_clearly_wrong_poses_are_refined_without_a_pilot(decided: Callable) -> None:
     decisions, _, _, tried = decided(effects.Config(), -1.0, pose_refinement=found(True))
     assert not tried and "pose_refinement" in decisions.on
 
@@ -125,7 +123,7 @@ def test_there_are_two_pilots_at_most(decided: Callable) -> None:
     assert table["view_dependence"]["reason"] == "one of two; not clear, and no pilot: 2 were made already"
 
 
-def test_a_pilot_that_diverges_leaves_the_effect_as_it_would_be(decided: Callable) -> None:
+def test_a_diverging_pilot_leaves_the_effect(decided: Callable) -> None:
     def diverging(*_: object) -> Pilot:
         raise NonFinite("loss", 3, {})
 
@@ -134,7 +132,7 @@ def test_a_pilot_that_diverges_leaves_the_effect_as_it_would_be(decided: Callabl
     assert table["exposure"]["reason"].endswith("not clear, and the pilot diverged: the loss of step 3 is not finite")
 
 
-def test_without_pilots_the_grey_zone_stays_as_the_method_was_published(decided: Callable) -> None:
+def test_without_pilots_the_grey_zone_follows_publication(decided: Callable) -> None:
     grey = {name: found(None) for name in ("exposure", "view_dependence", "pose_refinement")}
     decisions, table, _, tried = decided(effects.Config(pilot_steps=0), 1.0, **grey)
     assert not tried and decisions == Decisions({"view_dependence": {}, "background": {}})
@@ -164,9 +162,7 @@ def training_key(effects_folder: Path) -> str:
 
 
 @pytest.mark.parametrize("said", [False, None])
-def test_what_evidence_or_a_pilot_switches_off_trains_as_what_was_asked_to_be_off(
-    decided: Callable, tmp_path: Path, said: bool | None
-) -> None:
+def test_switched_off_by_evidence_trains_as_off_by_option(decided: Callable, tmp_path: Path, said: bool | None) -> None:
     names = ("exposure", "view_dependence", "background", "pose_refinement")
     told = {name: found(said if name in ("exposure", "pose_refinement") else False) for name in names}
     by_evidence, *_ = decided(effects.Config(pilots=3), -1.0, **told)
@@ -223,7 +219,7 @@ def test_pilots_are_made_as_far_as_they_fit(
         (101.0, ["pose_refinement", "view_dependence"]),
     ],
 )
-def test_a_pilot_that_fits_poses_has_to_fit_into_the_time_beside_the_others(
+def test_a_pose_fitting_pilot_must_fit_the_time(
     decided: Callable, monkeypatch: pytest.MonkeyPatch, seconds: float, made: list[str]
 ) -> None:
     monkeypatch.setattr(pilots, "expected_seconds", lambda *_: (40.0, 60.0))

@@ -78,9 +78,7 @@ def test_what_serves_several_effects_is_shared_out_among_them(monkeypatch: pytes
 
 
 @pytest.mark.parametrize(("shift", "called_for"), [(0.0002, None), (0.001, True)])
-def test_errors_of_poses_are_those_of_a_photo_of_a_thousand_pixels(
-    tmp_path: Path, shift: float, called_for: bool | None
-) -> None:
+def test_pose_errors_are_scaled_to_a_thousand_pixels(tmp_path: Path, shift: float, called_for: bool | None) -> None:
     found = [geometric(tmp_path / str(width), width, shift)["pose_refinement"] for width in (800, 4000)]
     for one in found:
         assert one.statistic == pytest.approx(max(1000 * shift, 0.5), rel=0.05) and one.called_for is called_for
@@ -88,7 +86,7 @@ def test_errors_of_poses_are_those_of_a_photo_of_a_thousand_pixels(
         assert one.words.endswith("; poses uncertain by 0.5 px")
 
 
-def test_rows_are_late_by_pixels_of_a_photo_of_a_thousand(tmp_path: Path) -> None:
+def test_row_delays_are_scaled_to_a_thousand_pixels(tmp_path: Path) -> None:
     small, large = (geometric(tmp_path / str(width), width, 0.0, 0.5)["rolling_shutter"] for width in (800, 4000))
     assert small.called_for is large.called_for is True and small.unit == "px at 1000"
     assert large.statistic == pytest.approx(small.statistic, rel=0.05)
@@ -100,7 +98,7 @@ def test_rows_are_late_by_pixels_of_a_photo_of_a_thousand(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("seen", [True, False])
 @pytest.mark.parametrize("called_for", [True, None, False])
-def test_gains_of_photos_from_very_different_distances_are_left_to_a_pilot(called_for: bool | None, seen: bool) -> None:
+def test_gains_across_distances_are_left_to_a_pilot(called_for: bool | None, seen: bool) -> None:
     exposure = Evidence(0.2, "EV", 0.1, 0.01, called_for, "gains span 0.4 EV")
     scale = Evidence(5.0 if seen else 2.0, "×", 4.0, 0.01, seen, "pixels differ")
     found = unless_pixels_differ(exposure, scale)
@@ -116,7 +114,7 @@ def candidate(group: int, model: str, error: float | None, chosen: bool = False)
     return {"group": group, "model": model, "held_out_px": error, "noise_px": noise, "chosen": chosen}
 
 
-def test_a_lens_is_compared_with_the_simplest_sound_candidate_of_its_own_group() -> None:
+def test_lenses_compare_with_their_groups_simplest_sound_one() -> None:
     rows = [
         candidate(0, "SIMPLE_PINHOLE", None),
         candidate(0, "PINHOLE", 0.9),

@@ -61,7 +61,7 @@ def test_a_wrong_exposure_loses(trial: PilotScene) -> None:
         (PLAIN.without("view_dependence"), PLAIN, False),
     ],
 )
-def test_poses_of_photos_kept_back_are_fitted_wherever_an_arm_refines_poses(
+def test_validation_poses_are_fitted_wherever_poses_are_refined(
     trial: PilotScene, monkeypatch: pytest.MonkeyPatch, off: Decisions, on: Decisions, fitted: bool
 ) -> None:
     asked: list[bool] = []
@@ -77,7 +77,7 @@ def test_poses_of_photos_kept_back_are_fitted_wherever_an_arm_refines_poses(
 
 
 @pytest.mark.parametrize(("device", "fit"), [("cpu", 0.02), ("cuda", 0.5)])
-def test_a_pilot_is_foretold_by_its_steps_and_the_poses_that_it_fits_on_the_cpu(
+def test_pilots_are_predicted_by_steps_and_fitted_poses(
     inputs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, device: str, fit: float
 ) -> None:
     on = {"cpu": fit, "cuda": 0.02}  # seconds of a step
@@ -109,7 +109,7 @@ def test_too_few_photos_make_no_pilot(tmp_path: Path) -> None:
     ],
     ids=["a dot", "a small square"],
 )
-def test_photos_of_which_masks_leave_too_little_at_its_size_make_no_pilot(
+def test_heavily_masked_photos_make_no_pilot(
     left: tuple, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pilots, "LONG_SIDE", WIDTH // 2)
@@ -126,7 +126,7 @@ def test_what_pays_is_more_than_noise_and_than_nothing(gain: float, noise: float
     assert Pilot(gain, noise, 0.0).pays is pays
 
 
-def test_noise_is_that_of_seeds_or_of_photos_whichever_is_more() -> None:
+def test_noise_is_the_larger_of_seeds_and_photos() -> None:
     student = 4.303 / 3**0.5  # 97.5 % for three, over the root of how many
     assert pilots._noise([[1.0] * 3, [3.0] * 3, [2.0] * 3]) == pytest.approx(student, rel=1e-3)
     assert pilots._noise([[1.0, 5.0, 3.0]] * 3) == pytest.approx(2 * student, rel=1e-3)

@@ -155,9 +155,7 @@ def test_clipped_windows_are_saturated(tmp_path: Path, progress: SilentProgress)
     assert np.array_equal(tracks.saturated, bright)
 
 
-def test_a_channel_that_is_dark_beside_the_others_leaves_them_their_gains(
-    tmp_path: Path, progress: SilentProgress
-) -> None:
+def test_a_dark_channel_leaves_the_others_their_gains(tmp_path: Path, progress: SilentProgress) -> None:
     """Photos by lamplight: their blue is cut off nearly everywhere."""
     scene, points = photographed_points(tmp_path, np.linspace(0.8, 1.4, VIEWS))
     by_day = fit_exposure(look_at_photos(tmp_path, scene, points, progress).tracks)

@@ -20,7 +20,7 @@ def _view(name: str, centre: tuple[float, float, float] = (0, 0, 0), angle: floa
     return View(name, f"images/{name}", 0, pose, 0.1, 4.0, "train")
 
 
-def test_mean_of_photos_of_one_size_is_an_image_that_minimises_the_squared_error():
+def test_the_mean_photo_minimises_the_squared_error():
     photos = torch.rand(5, 6, 8, 3, generator=torch.Generator().manual_seed(0))
     mean = mean_photo(photos, [None] * 5)
     prediction = mean.shown_at(6, 8)
@@ -30,7 +30,7 @@ def test_mean_of_photos_of_one_size_is_an_image_that_minimises_the_squared_error
         assert (photos - prediction - shift).square().mean() > best
 
 
-def test_photos_of_different_sizes_have_a_mean_colour_each_photo_counting_once():
+def test_mean_colour_counts_each_size_of_photo_once():
     mean = mean_photo(
         [torch.full((2, 2, 3), 0.2), torch.full((40, 30, 3), 0.8), torch.full((2, 2, 3), 0.2)], [None] * 3
     )
@@ -38,7 +38,7 @@ def test_photos_of_different_sizes_have_a_mean_colour_each_photo_counting_once()
     assert torch.allclose(mean.shown_at(5, 7), torch.full((5, 7, 3), 0.4))
 
 
-def test_a_mean_of_masked_photos_is_of_what_they_are_used_for():
+def test_a_mean_of_masked_photos_uses_unmasked_pixels():
     photos = [torch.full((1, 3, 3), value) for value in (0.2, 0.4, 0.9)]
     used = [torch.tensor([[True, False, False]]), torch.tensor([[True, True, False]]), None]
     mean = mean_photo(photos, used)
@@ -53,7 +53,7 @@ def test_a_photo_that_is_masked_away_does_not_count():
     assert torch.allclose(mean_photo(photos, [None, nothing]).shown_at(2, 2), photos[0])
 
 
-def test_where_masks_leave_nothing_of_any_photo_the_mean_colour_is_that_of_all():
+def test_fully_masked_photos_take_the_overall_mean():
     nothing = torch.zeros(2, 2, dtype=torch.bool)
     mean = mean_photo([torch.full((2, 2, 3), 0.3), torch.ones(2, 2, 3)], [nothing, nothing])
     assert torch.allclose(mean.shown_at(2, 2), torch.full((2, 2, 3), 0.65))

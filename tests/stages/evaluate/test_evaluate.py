@@ -196,7 +196,7 @@ def exposed(inputs: dict[str, Path], log_gain: float, noise: float) -> dict[str,
 
 
 @pytest.mark.parametrize("stops", [-1.0, 0.5])
-def test_the_exposure_of_a_test_photo_is_no_fault_of_the_field(stops: float, make: Make, tmp_path: Path, progress: Any):
+def test_a_test_photos_exposure_is_no_fault(stops: float, make: Make, tmp_path: Path, progress: Any):
     log_gain = stops * math.log(2)
     metrics, line = _run(exposed(make(), log_gain, 0.03), tmp_path / "out", progress)
     noise_alone = -20 * math.log10(0.03)
@@ -246,7 +246,7 @@ def test_what_masks_ignore_does_not_count(make: Make, tmp_path: Path, progress: 
     assert metrics["psnr_mean_image"] < 25 and metrics["ssim"] > 0.5
 
 
-def test_a_photo_of_which_masks_leave_nothing_at_this_size_is_not_scored(make: Make, tmp_path: Path, progress: Any):
+def test_a_fully_masked_photo_is_not_scored(make: Make, tmp_path: Path, progress: Any):
     inputs = masked(make(downscale=2), np.zeros((HEIGHT, WIDTH), bool))
     dot = np.zeros((HEIGHT, WIDTH), np.uint8)
     dot[3, 3] = 255
@@ -267,7 +267,7 @@ def test_masks_that_leave_nothing_of_any_test_photo_are_named(make: Make, tmp_pa
     ]
 
 
-def test_a_slow_field_is_scored_on_fewer_photos_and_says_so(make: Make, tmp_path: Path, progress: Any):
+def test_a_slow_field_is_scored_on_fewer_photos(make: Make, tmp_path: Path, progress: Any):
     metrics, line = _run(make(speed=5 * WIDTH * HEIGHT), tmp_path / "out", progress)
     words = "3 of 4 test photos are scored, evenly spread"
     assert progress.notes == [
@@ -354,7 +354,7 @@ def test_affordable_is_the_largest_even_choice_within_the_budget(pixels: list[in
         assert gaps[1:-1].max() - gaps[1:-1].min() <= 1
 
 
-def test_poses_cannot_be_fitted_to_a_field_without_gradients_of_rays(make: Make, tmp_path: Path, progress: Any) -> None:
+def test_poses_need_gradients_of_rays(make: Make, tmp_path: Path, progress: Any) -> None:
     inputs = make()
     with refused("evaluate.no-pose-fit", "sky"):
         _run(inputs, tmp_path / "on", progress, fit_poses="on")

@@ -24,9 +24,7 @@ from tests.stages.photo_scene import photographed
 from tests.synthetic_photos import Quiet
 
 
-def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_exposed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fitted_poses_are_scored_at_the_photos_exposure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs, scene = photographed(tmp_path)
     kernels = load_backend(chosen_backend("cpu"), "cpu")
     field = HashGridField(
@@ -53,7 +51,7 @@ def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_expo
     assert scored["psnr_pose_fitted"] == pytest.approx(posed)
 
 
-def test_refined_poses_are_learnt_in_units_of_what_photos_see_and_written_in_scene_units(tmp_path: Path) -> None:
+def test_refined_poses_are_written_in_scene_units(tmp_path: Path) -> None:
     inputs, scene = photographed(tmp_path)
     views = scene.of_split("train")
     dataset = training_dataset(inputs["ingest"], scene, "train", 1.0, Quiet())
@@ -65,7 +63,7 @@ def test_refined_poses_are_learnt_in_units_of_what_photos_see_and_written_in_sce
     assert learnt[views[1].name] == [0.0, 0.0, 0.0, 0.25, 0.0, -0.5] and learnt[views[0].name] == [0.0] * 6
 
 
-def test_a_test_photos_pose_is_fitted_in_units_of_what_it_sees(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_test_pose_is_fitted_in_viewing_distances(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[float] = []
 
     def fit(*given: Any) -> PoseRefinement:
@@ -102,7 +100,5 @@ def test_poses_are_fitted_where_training_refined_them_or_as_asked(asked: Any, re
         ((None, None, None), ""),
     ],
 )
-def test_the_line_names_what_was_fitted_where_that_makes_a_difference(
-    scores: tuple[float | None, ...], words: str
-) -> None:
+def test_the_line_names_what_was_fitted(scores: tuple[float | None, ...], words: str) -> None:
     assert evaluate._right_halves(dict(zip(evaluate.RIGHT_HALVES, scores, strict=True))) == words

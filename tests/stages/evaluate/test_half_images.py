@@ -75,7 +75,7 @@ def test_the_background_has_no_exposure():
     assert raw is not None and fitted is not None and fitted > 70 > 25 > raw
 
 
-def test_a_photos_viewing_distance_is_that_of_what_is_opaque_where_it_may_be_judged():
+def test_viewing_distance_is_of_opaque_unmasked_pixels():
     depth, opacity = torch.tensor([[1.0, 2.0, 3.0, 50.0], [9.0, 9.0, 9.0, 9.0]]), torch.ones(2, 4)
     left = torch.tensor([[True] * 4, [False] * 4])
     opacity[0, 3] = 0.4

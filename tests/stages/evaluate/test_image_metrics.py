@@ -67,13 +67,13 @@ def test_interval_holds_the_mean_and_moves_with_the_values(values: list[float], 
 
 
 @pytest.mark.parametrize("count", [3, 5, 12])
-def test_95_of_100_intervals_hold_the_truth_however_few_the_photos(count: int):
+def test_intervals_hold_the_truth_95_times_in_100(count: int):
     samples = np.random.default_rng(0).normal(20, 3, size=(4000, count)).tolist()
     held = np.mean([low <= 20 <= high for low, high in map(_interval, samples)])
     assert 0.94 < held < 0.96
 
 
-def test_interval_of_three_is_that_of_the_tables_and_of_many_two_standard_errors_either_side():
+def test_the_interval_of_three_is_that_of_tables():
     assert _interval([21.0, 20.0, 19.0]) == pytest.approx(
         (20 - 4.3027 / math.sqrt(3), 20 + 4.3027 / math.sqrt(3)), abs=1e-4
     )

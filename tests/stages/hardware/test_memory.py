@@ -32,7 +32,7 @@ def test_a_container_of_version_2(tmp_path: Path):
     assert list(rooms_in_groups(tmp_path / "self", tmp_path / "cgroup")) == [350], "a group above the own one counts"
 
 
-def test_a_container_of_version_1_that_sees_the_path_of_its_host(tmp_path: Path):
+def test_a_version_1_container_sees_its_hosts_path(tmp_path: Path):
     files = {"memory__limit_in_bytes": 1000, "memory__usage_in_bytes": 900, "memory__stat": "total_inactive_file 300"}
     write_group(tmp_path / "cgroup/memory", **files)
     (tmp_path / "self").write_text("9:cpu,cpuacct:/x\n4:memory:/docker/0123\n0::/\n")

@@ -87,7 +87,7 @@ def test_every_twin_leads_to_a_photo_that_stays(names: list[str]) -> None:
         assert name not in found
 
 
-def test_a_map_belongs_to_the_photo_and_not_to_another_map() -> None:
+def test_a_map_belongs_to_a_photo() -> None:
     maps = [f"{folder}/1.png" for folder in ("conf", "depth", "instance", "label", "normal", "semantics")]
     assert auxiliary_files([*maps, "rgb/1.jpg"]) == dict.fromkeys(maps, "rgb/1.jpg")
     assert auxiliary_files([*maps[:3], "label/1.jpg"]) == dict.fromkeys(maps[:3], "label/1.jpg")
@@ -106,7 +106,7 @@ def put(file: Path, seed: int) -> None:
     Image.fromarray(np.random.default_rng(seed).integers(0, 256, (24, 32, 3), dtype=np.uint8)).save(file)
 
 
-def test_what_is_set_aside_is_said_and_a_mask_can_be_used_as_is_said(tmp_path: Path, progress: Any) -> None:
+def test_unused_files_are_told_and_used_when_asked(tmp_path: Path, progress: Any) -> None:
     for index in range(5):
         put(tmp_path / f"in/image/{index}.png", index)
         mask = np.full((24, 32), 255, np.uint8)
@@ -165,9 +165,7 @@ def kinds(deep: int, grey: int, colour: int) -> dict[str, Stored]:
 @pytest.mark.parametrize(("deep", "grey", "colour", "aside"), [
     (10, 0, 10, 10), (10, 0, 9, 10), (3, 10, 10, 3), (10, 0, 8, 0), (10, 10, 8, 0), (10, 10, 0, 0), (0, 5, 5, 0),
 ])  # fmt: skip
-def test_photos_in_deep_grey_are_photos_where_fewer_are_in_colour(
-    deep: int, grey: int, colour: int, aside: int
-) -> None:
+def test_deep_grey_photos_count_among_fewer_in_colour(deep: int, grey: int, colour: int, aside: int) -> None:
     assert depth_maps(kinds(deep, grey, colour)) == {str(index) for index in range(aside)}
 
 
@@ -190,7 +188,7 @@ def test_masks_beside_photos_that_are_not_used_are_named(
     assert words not in progress.notes[1:] and read_photos(tmp_path / "3")[0].mask is not None
 
 
-def test_cameras_that_lie_with_photos_are_named_with_what_would_use_them(tmp_path: Path, progress: Any) -> None:
+def test_cameras_beside_photos_are_named_with_their_option(tmp_path: Path, progress: Any) -> None:
     scene = tmp_path / "my scene"
     for index in range(2):
         put(scene / f"images/{index}.png", index)
@@ -225,7 +223,7 @@ def test_cameras_that_would_not_be_accepted_are_not_named(other: str, tmp_path: 
     ("photo", "mask"),
     [("ä.jpg", unicodedata.normalize("NFD", "ä.png")), ("a.jpg", "a.PNG"), ("left/a.jpg", "left/a.jpg.png")],
 )
-def test_masks_that_are_not_used_are_seen_by_the_names_that_would_do(photo: str, mask: str, tmp_path: Path) -> None:
+def test_unused_masks_are_told_with_the_names_needed(photo: str, mask: str, tmp_path: Path) -> None:
     touch(tmp_path, f"frames/{photo}", f"masks/{mask}", "masks/another.png")
     assert unused_masks(find_source(tmp_path / "frames")) == tmp_path / "masks"
     assert not unused_masks(find_source(touch(tmp_path, "other/b.jpg") / "other"))

@@ -171,7 +171,7 @@ def test_only_the_first_frame_counts(tmp_path: Path) -> None:
     assert (decoded.suffix, decoded.notes) == (None, ("first of 2 frames",))
 
 
-def test_a_jpeg_that_ends_with_its_header_is_refused_in_words(tmp_path: Path) -> None:
+def test_a_jpeg_of_a_header_alone_is_refused(tmp_path: Path) -> None:
     """Without a place for pixels, there is no share of the picture that could be missing."""
     content = saved(tmp_path / "a.jpg", Image.fromarray(smooth())).read_bytes()
     frame = content.index(b"\xff\xc0")

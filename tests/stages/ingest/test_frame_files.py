@@ -59,14 +59,14 @@ def test_a_file_of_the_very_name_goes_first(tmp_path: Path) -> None:
     assert names(find_source(transforms(tmp_path / "transforms.json", "a.jpg", "b"))) == ["a.jpg", "b.png"]
 
 
-def test_another_spelling_leads_out_of_the_folder_no_more_than_the_name(tmp_path: Path) -> None:
+def test_another_spelling_leads_out_of_no_folder(tmp_path: Path) -> None:
     touch(tmp_path, "secret.jpg", "set/b.jpg")
     (tmp_path / "set/a.JPG").symlink_to(tmp_path / "secret.jpg")
     error = refusal(transforms(tmp_path / "set/transforms.json", "a.jpg", "b.jpg"))
     assert error.what == "rejected the photo 'a.JPG'"
 
 
-def test_a_linked_folder_of_photos_may_be_given_apart_from_its_cameras(tmp_path: Path) -> None:
+def test_a_linked_photo_folder_may_lack_its_cameras(tmp_path: Path) -> None:
     touch(tmp_path, "disk/images/a.jpg", "secret.jpg", "set/notes")
     (tmp_path / "set/images").symlink_to(tmp_path / "disk/images")
     cameras = transforms(tmp_path / "set/transforms.json", "images/a.jpg")
@@ -100,7 +100,7 @@ def test_an_absolute_path_may_lie_in_the_folder(tmp_path: Path) -> None:
     assert names(source) == ["images/0.jpg", "other/0.jpg"]
 
 
-def test_a_missing_photo_is_not_replaced_by_one_of_the_same_name(tmp_path: Path) -> None:
+def test_a_missing_photo_is_not_replaced_by_its_namesake(tmp_path: Path) -> None:
     touch(tmp_path, "left/0.jpg", "left/1.jpg", "old/1.jpg")
     assert "right/1.jpg" in names(find_source(transforms(tmp_path / "transforms.json", "left/0.jpg", "right/1.jpg")))
 
@@ -127,7 +127,7 @@ def test_masks_of_transforms_files_are_found_in_another_spelling(tmp_path: Path)
     assert find_source(tmp_path / "transforms.json").masks[0] == ("a.jpg.png", tmp_path / "masks/a.PNG")
 
 
-def test_masks_that_our_own_export_names_are_copies_of_those_of_the_photos(tmp_path: Path) -> None:
+def test_masks_named_by_our_export_are_copies(tmp_path: Path) -> None:
     touch(tmp_path, "set/a.jpg", "w.nerf/output/masks/a.jpg.png")
     frame = {"file_path": "images/a.jpg", "photo": "a.jpg", "mask_path": "masks/a.jpg.png", "transform_matrix": []}
     cameras = tmp_path / "w.nerf/output/transforms.json"
@@ -139,7 +139,7 @@ def test_masks_that_our_own_export_names_are_copies_of_those_of_the_photos(tmp_p
     assert found.masks == (("a.png", tmp_path / "set/masks/a.png"),) and unused_masks(found) is None
 
 
-def test_a_folder_of_reduced_photos_stands_in_for_the_one_that_is_named(tmp_path: Path) -> None:
+def test_a_reduced_folder_stands_in_for_the_named_one(tmp_path: Path) -> None:
     touch(tmp_path, "images/a.jpg", "images/left/b.JPG", "images_4/a.jpg", "images_4/left/b.jpg", "other_4/a.jpg")
     cameras = transforms(tmp_path / "transforms.json", "images/a.jpg", "./images/left/b.JPG")
     assert names(find_source(tmp_path / "images_4", cameras)) == ["a.jpg", "left/b.jpg"]

@@ -150,7 +150,7 @@ def groups(folder: Path, out: Path, progress: Any) -> list[int]:
     return [photo.camera_group for photo in read_photos(out)]
 
 
-def test_two_phones_in_one_folder_are_two_cameras_wherever_their_photos_lie(tmp_path: Path, progress: Any) -> None:
+def test_two_phones_in_one_folder_are_two_cameras(tmp_path: Path, progress: Any) -> None:
     cameras = [("A", "1"), ("B", "1"), ("A", "1"), ("A", "2"), ("A", "1", "tele")]
     (tmp_path / "in/more").mkdir(parents=True)
     for seed, camera in enumerate(cameras):
@@ -175,7 +175,7 @@ def test_where_photos_were_taken_is_written_down(tmp_path: Path, progress: Any) 
     assert places == [(None, None, None), (48.5, 9.0, 341.5)]
 
 
-def test_a_photo_far_less_sharp_than_its_neighbours_is_named_and_kept(tmp_path: Path, progress: Any) -> None:
+def test_a_blurred_photo_is_named_and_kept(tmp_path: Path, progress: Any) -> None:
     (tmp_path / "in").mkdir()
     for index in range(6):
         wall = blots(index, 240, 180)

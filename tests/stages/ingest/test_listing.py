@@ -24,17 +24,17 @@ def test_a_video_is_taken_whatever_its_camera_writes_beside_it(tmp_path: Path, b
 
 
 @pytest.mark.parametrize("photo", ["a.jpg", "a.JP2", "a.DNG", "a.HIF"])
-def test_what_is_an_image_by_its_ending_goes_before_a_video(tmp_path: Path, photo: str) -> None:
+def test_an_image_by_its_ending_precedes_a_video(tmp_path: Path, photo: str) -> None:
     source = find_source(touch(tmp_path, "clip.mp4", photo, "unknown"))
     assert (source.kind, names(source)) == ("photos", [photo, "unknown"])
 
 
-def test_photos_of_unknown_endings_are_not_passed_over_for_a_video(tmp_path: Path) -> None:
+def test_photos_of_unknown_endings_precede_a_video(tmp_path: Path) -> None:
     source = find_source(touch(tmp_path, "clip.mp4", "0.x", "1.x", "2.x"))
     assert (source.kind, names(source)) == ("photos", ["0.x", "1.x", "2.x"])
 
 
-def test_files_without_an_ending_are_tried_where_there_is_no_one_video(tmp_path: Path) -> None:
+def test_files_without_endings_are_tried_without_a_video(tmp_path: Path) -> None:
     assert names(find_source(touch(tmp_path, "0", "1", "0.srt"))) == ["0", "1"]
     assert names(find_source(touch(tmp_path, "a.mp4", "b.mp4"))) == ["0", "1"]
 

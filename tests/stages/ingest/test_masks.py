@@ -123,7 +123,7 @@ def test_half_bright_is_used_and_transparent_ignored(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_mask_of_the_stored_shape_is_turned_like_the_photo(orientation: int, tmp_path: Path) -> None:
+def test_a_mask_of_the_stored_shape_is_turned(orientation: int, tmp_path: Path) -> None:
     mask = ignoring(20, 10)
     stored = {
         5: mask.T,
@@ -137,7 +137,7 @@ def test_a_mask_of_the_stored_shape_is_turned_like_the_photo(orientation: int, t
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_where_its_shape_does_not_tell_a_mask_is_as_others_of_its_set(orientation: int, tmp_path: Path) -> None:
+def test_ambiguous_masks_follow_others_of_their_set(orientation: int, tmp_path: Path) -> None:
     square = ignoring(20, 10, WIDTH, WIDTH)
     found = read_mask(saved(tmp_path, square), WIDTH, WIDTH, orientation, stored=True)
     assert np.array_equal(found.pixels, np.asarray(upright(Image.fromarray(square), orientation)))
@@ -151,7 +151,7 @@ def test_where_its_shape_does_not_tell_a_mask_is_as_others_of_its_set(orientatio
     ("orientation", "size", "turned", "noted"),
     [(6, (32, 24), True, False), (6, (24, 32), False, False), (4, (32, 24), False, True)],
 )
-def test_masks_of_half_turned_photos_are_as_the_shapes_of_others_tell(
+def test_masks_of_half_turned_photos_follow_their_shapes(
     orientation: int, size: tuple[int, int], turned: bool, noted: bool, tmp_path: Path, progress: Any
 ) -> None:
     folder = tmp_path / "in"
@@ -194,7 +194,7 @@ def test_any_reduction_rounded_to_pixels_keeps_its_shape(width: int, height: int
     assert not _same_shape((reduced[0] + width // 2 + 2, reduced[1]), (width, height)) or width > 50 * height
 
 
-def test_a_mask_that_cannot_be_used_is_a_reason_to_refuse_the_photo(tmp_path: Path) -> None:
+def test_an_unusable_mask_refuses_its_photo(tmp_path: Path) -> None:
     assert reason(saved(tmp_path, ignoring(5, 5, 40, 40))) == (
         "its mask m.png does not fit: it is 40×40 and the photo 48×32"
     )
@@ -233,14 +233,14 @@ def test_features_lie_where_nothing_is_ignored_or_transparent(tmp_path: Path) ->
     assert not (tmp_path / "none").exists()
 
 
-def test_a_reduced_mask_uses_only_what_is_used_as_a_whole(tmp_path: Path) -> None:
+def test_a_reduced_mask_keeps_only_wholly_used_pixels(tmp_path: Path) -> None:
     file = saved(tmp_path, ignoring(21, 0))
     assert np.array_equal(load_mask(file, WIDTH, HEIGHT), ignoring(21, 0) > 0)
     assert np.array_equal(load_mask(file, 12, 8), np.broadcast_to(np.arange(12) < 5, (8, 12)))
     assert np.array_equal(load_mask(file, 7, 3), np.broadcast_to(np.arange(7) < 3, (3, 7)))  # 3 / 7 of 48 is 20.6
 
 
-def test_what_alpha_and_mask_leave_is_a_mask_of_its_own(tmp_path: Path, progress: Any) -> None:
+def test_alpha_and_mask_combine_into_one_mask(tmp_path: Path, progress: Any) -> None:
     folder = put(tmp_path / "in", "a.jpg")
     alpha = np.full((24, 32), 255, np.uint8)
     alpha[:6], alpha[6] = 127, 128

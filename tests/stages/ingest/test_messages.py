@@ -51,7 +51,7 @@ def test_all_notes_are_kept(tmp_path: Path, progress: Any) -> None:
     assert progress.notes[10] == "… and 2 more, all in notes.json"
 
 
-def test_masks_beside_a_folder_of_photos_are_used_and_strays_said_once(tmp_path: Path, progress: Any) -> None:
+def test_masks_beside_photos_are_used_strays_told_once(tmp_path: Path, progress: Any) -> None:
     put(tmp_path / "in/photos", "a.jpg", "b.jpg")
     (tmp_path / "in/masks").mkdir()
     for name in ("a.png", "stray.png"):
@@ -85,9 +85,7 @@ def test_where_it_fails_all_refusals_are_said_by_reason(tmp_path: Path, progress
     ]
 
 
-def test_a_photo_that_memory_is_short_of_is_named_and_none_that_is_refused_by_its_ending(
-    tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_photo_too_large_for_memory_is_named(tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = put(tmp_path / "in", "a.jpg", "b.jpg")
     Image.new("RGB", (500, 400)).save(folder / "raw.dng", "TIFF")
     monkeypatch.setattr("stages.hardware.memory.available_bytes", lambda: 2**20)

@@ -48,7 +48,7 @@ def test_a_smear_of_four_pixels_counts_as_blurred() -> None:
     assert smeared[1] < BLURRED < smeared[0]
 
 
-def test_each_is_compared_with_three_on_each_side_of_its_own_group() -> None:
+def test_each_photo_is_compared_with_three_neighbours_a_side() -> None:
     values = [10.0, 20.0, 30.0, 5.0, 40.0, 50.0, 60.0, 1000.0]
     relative = relative_sharpness(values, [0] * 8)
     assert relative[3] == pytest.approx(5 / 35, rel=1e-3)  # of 10 20 30 | 40 50 60

@@ -59,7 +59,7 @@ def test_what_is_no_photo_is_skipped(tmp_path: Path) -> None:
     assert names(find_source(tmp_path)) == ["a.jpg"]
 
 
-def test_images_inside_is_the_root_and_transforms_beside_it_is_not_used(tmp_path: Path) -> None:
+def test_images_inside_is_the_root(tmp_path: Path) -> None:
     touch(tmp_path, "images/a.jpg", "images_2/a.jpg", "thumb.png")
     transforms(tmp_path / "transforms.json", "images/a.jpg")
     source = find_source(tmp_path)
@@ -72,7 +72,7 @@ def test_images_inside_without_photos_is_not_the_root(tmp_path: Path) -> None:
     assert (source.root, names(source), photos_beside(source, tmp_path)) == (tmp_path, ["a.jpg"], 0)
 
 
-def test_photos_beside_images_are_counted_those_of_other_folders_are_not(tmp_path: Path) -> None:
+def test_photos_beside_images_are_counted(tmp_path: Path) -> None:
     touch(tmp_path, "images/a.jpg", "images_4/a.jpg", "b.JPG", ".c.jpg", "database.db", "unknown")
     assert photos_beside(find_source(tmp_path), tmp_path) == 1
     assert photos_beside(find_source(tmp_path / "images"), tmp_path / "images") == 0
@@ -133,7 +133,7 @@ def test_a_photo_folder_with_a_colmap_model(tmp_path: Path, given: str, extensio
     assert names(source) == ["a.jpg"]
 
 
-def test_the_account_of_a_model_of_ours_says_what_its_cameras_are(tmp_path: Path) -> None:
+def test_our_models_account_names_its_cameras(tmp_path: Path) -> None:
     sparse = touch(tmp_path, "registration.json", *(f"sparse/{name}" for name in COLMAP)) / "sparse"
     assert [file.name for file in camera_files(sparse)] == [*COLMAP, "registration.json"]
     other = sparse.rename(tmp_path / "0")
@@ -156,7 +156,7 @@ def test_of_several_colmap_models_the_largest_that_fits_is_recommended(tmp_path:
     assert error.hint == f"Give the one with most: --cameras {tmp_path}/m/sparse/3"
 
 
-def test_an_export_of_ours_finds_the_photos_by_their_own_names(tmp_path: Path) -> None:
+def test_our_export_finds_photos_by_their_names(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
     (photos / "ä.jpg").write_bytes(b"")
@@ -168,7 +168,7 @@ def test_an_export_of_ours_finds_the_photos_by_their_own_names(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("linked", [True, False])
-def test_a_photo_that_was_removed_is_one_that_is_not_there_for_an_export_of_ours(tmp_path: Path, linked: bool) -> None:
+def test_a_removed_photo_is_missing_from_our_export(tmp_path: Path, linked: bool) -> None:
     touch(tmp_path, "photos/a.jpg", "kept/a.jpg", "kept/b.jpg", "output/x")
     if linked:
         (tmp_path / "output/images").symlink_to(tmp_path / "kept")
@@ -290,7 +290,7 @@ def test_a_video_or_a_folder_with_nothing_else(tmp_path: Path, given: str) -> No
     )
 
 
-def test_masks_are_listed_after_the_names_they_would_have_without_their_folder(tmp_path: Path) -> None:
+def test_masks_are_listed_by_their_names_without_folder(tmp_path: Path) -> None:
     touch(tmp_path, "a.jpg", "left/b.jpg", "masks/a.png", "masks/left/b.jpg.png", "left/masks/b.png", "masks/.x.png")
     touch(tmp_path, "empty/masks/z.png")
     source = find_source(tmp_path)
@@ -358,7 +358,7 @@ def test_a_folder_without_read_permission(tmp_path: Path) -> None:
         (tmp_path / "a").chmod(0o755)
 
 
-def test_links_that_lead_nowhere_are_left_to_be_refused_by_name(tmp_path: Path) -> None:
+def test_dead_links_are_refused_by_name(tmp_path: Path) -> None:
     touch(tmp_path, "a.jpg")
     (tmp_path / "b.jpg").symlink_to("annex/b")
     assert names(find_source(tmp_path)) == ["a.jpg", "b.jpg"] and not is_gone(tmp_path)
@@ -371,7 +371,7 @@ def test_links_that_lead_nowhere_are_left_to_be_refused_by_name(tmp_path: Path) 
     assert refusal(tmp_path).why == "1 of its files are links to what is not there"
 
 
-def test_a_linked_folder_that_is_gone_is_passed_over_as_it_was_before(tmp_path: Path) -> None:
+def test_a_dead_linked_folder_is_skipped(tmp_path: Path) -> None:
     touch(tmp_path, "a.jpg")
     (tmp_path / "archive").symlink_to("drive")
     assert names(find_source(tmp_path)) == ["a.jpg"]

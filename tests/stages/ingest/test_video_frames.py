@@ -49,7 +49,7 @@ def taken(path: Path, folder: Path, progress: Any, most: int = 300) -> list[Take
     return take_frames(path, most, folder, progress)
 
 
-def test_frames_are_steps_of_the_picture_apart_and_a_pause_gives_one(tmp_path: Path, progress: Any) -> None:
+def test_frames_are_picture_steps_apart_and_pauses_one(tmp_path: Path, progress: Any) -> None:
     ways = [*[0.0] * 8, *np.arange(1, 41) / 50, *[0.8] * 8]
     frames = taken(clip(tmp_path / "a.mp4", panned(*ways)), tmp_path / "out", progress)
     steps = np.diff([ways[frame.number] for frame in frames])
@@ -241,5 +241,5 @@ def test_a_video_whose_end_is_missing_is_said(tmp_path: Path, progress: Any) -> 
 
 
 @pytest.mark.parametrize(("decoded", "announced", "lacks"), [(29, 30, False), (27, 30, True), (985, 1000, False)])
-def test_a_whole_video_may_count_a_frame_or_two_too_many(decoded: int, announced: int, lacks: bool) -> None:
+def test_a_whole_video_may_announce_two_frames_too_many(decoded: int, announced: int, lacks: bool) -> None:
     assert lacks_frames(decoded, announced) == lacks

@@ -33,9 +33,7 @@ def psnr(one: np.ndarray, other: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / np.mean((one.astype(float) - other) ** 2)))
 
 
-def test_a_turned_jpeg_stays_one_within_45_decibels_and_the_same_bytes_come_out_again(
-    tmp_path: Path, progress: Any
-) -> None:
+def test_a_turned_jpeg_stays_within_45_decibels(tmp_path: Path, progress: Any) -> None:
     (tmp_path / "in").mkdir()
     for seed in range(3):
         photo(seed).save(tmp_path / f"in/{seed}.jpg", quality=92, exif=exif_with(6))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from stages.io.ascii_names import ascii_files
 
 
-def test_names_that_are_safe_are_kept_and_others_tell_what_they_were() -> None:
+def test_safe_names_are_kept_others_stay_readable() -> None:
     names = [("IMG_1.JPG", ".jpg"), ("sub/b-2.png", ".png"), ("Café au lait.jpg", ".jpg"), ("b.heic", ".png")]
     files = ascii_files(names)
     assert files[:2] == ["IMG_1.JPG", "sub/b-2.png"]

@@ -163,7 +163,7 @@ def test_a_count_that_is_too_large_ends_with_the_file(name: str, count: int, tmp
         read_model(tmp_path)
 
 
-def test_a_keypoint_count_that_is_too_large_ends_with_the_file(tmp_path: Path) -> None:
+def test_a_keypoint_count_too_large_ends_the_file(tmp_path: Path) -> None:
     for file, content in colmap_models()["bin"].items():
         (tmp_path / file).write_bytes(content)
     overwritten(tmp_path / "images.bin", 8 + 64 + len("p0.png") + 1, "<Q", 2**61)

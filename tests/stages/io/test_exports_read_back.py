@@ -170,7 +170,7 @@ def test_colmap_reads_the_model_that_was_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("write", ["write_binary", "write_text"])
-def test_poses_of_a_rig_of_two_cameras_are_those_of_its_images(write: str, tmp_path: Path) -> None:
+def test_poses_of_a_two_camera_rig_are_its_images(write: str, tmp_path: Path) -> None:
     """COLMAP 4 writes what rigs and frames say of poses into images, too: rigs and frames are not read."""
     model = pycolmap.Reconstruction()
     sensors = [pycolmap.sensor_t(pycolmap.SensorType.CAMERA, i) for i in (1, 2)]

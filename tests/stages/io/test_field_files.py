@@ -141,7 +141,7 @@ def test_a_field_keeps_to_torch_if_that_trained_it(trained_with: BackendName, tm
     assert [note.split(":")[0] for note in progress.notes] == [BY_TORCH] * (trained_with == "torch")
 
 
-def test_a_field_of_warp_is_read_without_it_and_the_reason_said(tmp_path: Path, progress, monkeypatch) -> None:
+def test_a_warp_field_is_read_without_warp(tmp_path: Path, progress, monkeypatch) -> None:
     save_field(tmp_path, HashGridField(GRID, 5, load_backend("warp", "cpu")), INFO)
     monkeypatch.setattr("stages.hardware.backend.why_not_warp", lambda device: "it is not there")
     loaded, _ = load_field(tmp_path, "cpu", progress)

@@ -5,7 +5,7 @@ import pytest
 from stages.io.live_line import live_line
 
 
-def test_it_speaks_while_the_block_is_busy_and_once_more_at_the_end(progress, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_speaks_while_busy_and_at_the_end(progress, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stages.io.live_line.PERIOD_SECONDS", 0.01)
     with live_line(progress, lambda: ("working", 0.5)):
         deadline = time.monotonic() + 5

@@ -92,9 +92,7 @@ def test_large_photos_are_loaded_by_fewer_threads(
     assert loaders([tmp_path / "large.png", tmp_path / "small.png"]) == expected
 
 
-def test_what_ingest_accepted_is_no_bomb_to_a_process_that_decodes_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_accepted_photos_are_no_bomb_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pillow refuses more than 179 megapixels, ingest more than 250."""
     photo, mask = stored(tmp_path, random_pixels(9, 7, 3)), tmp_path / "mask.png"
     Image.fromarray(random_pixels(9, 7, 1)[..., 0]).save(mask)
@@ -111,7 +109,7 @@ def photo(**changes: object) -> Photo:
     return Photo(**values | changes)  # pyright: ignore[reportArgumentType]
 
 
-def test_a_photo_in_a_folder_keeps_it_in_its_name_for_colmap() -> None:
+def test_a_photo_keeps_its_folder_in_colmap_names() -> None:
     photo = Photo("Küche/1.jpg", "images/Kuche/images/1.jpg", 60, 40, 0, None, None, False, 1.0)
     assert photo.image_name == "Kuche/images/1.jpg"
 

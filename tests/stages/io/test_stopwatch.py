@@ -33,7 +33,7 @@ def test_what_is_counted_is_kept_now_and_then(tmp_path: Path, monkeypatch: pytes
     assert not file.exists(), "not once after the block"
 
 
-def test_what_was_kept_counts_whatever_the_times_of_the_files_say(tmp_path: Path) -> None:
+def test_kept_time_counts_whatever_file_times_say(tmp_path: Path) -> None:
     file = tmp_path / "clock.json"
     write_elapsed(file, 100.0)
     for day in (0.0, time.time() + 86_400):
@@ -44,7 +44,7 @@ def test_what_was_kept_counts_whatever_the_times_of_the_files_say(tmp_path: Path
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b'{"spent": 1.0}', b"null", b"-3"])
-def test_nothing_was_spent_where_nobody_began_or_no_number_is_kept(tmp_path: Path, content: bytes) -> None:
+def test_nothing_is_spent_without_a_start_or_number(tmp_path: Path, content: bytes) -> None:
     assert elapsed(tmp_path / "none.partial/attempts.json") == 0
     (tmp_path / "attempts.json").write_bytes(content)
     assert elapsed(tmp_path / "attempts.json") == 0

@@ -83,7 +83,7 @@ def test_fisheyes_are_declared_where_other_programs_look() -> None:
     assert ["is_fisheye" in frame for frame in mixed["frames"]] == [True, False, True, False]
 
 
-def test_region_of_interest_lies_in_the_unit_cube_of_instant_ngp() -> None:
+def test_the_region_lies_in_instant_ngps_unit_cube() -> None:
     content = transforms(scene_of((PINHOLE,), ring(4)))
     centre = SCENE_FROM_SFM.inverse().points(np.zeros(3))
     np.testing.assert_allclose(content["scale"] * centre + content["offset"], 0.5)
@@ -130,7 +130,7 @@ def test_a_lens_comes_back_as_it_was_written(camera: Camera) -> None:
     assert read_intrinsics(intrinsics(camera), 1, 1) == camera
 
 
-def test_a_model_the_format_lacks_is_written_as_the_nearest_and_says_so() -> None:
+def test_an_unknown_model_is_exported_as_the_nearest() -> None:
     values = intrinsics(Camera("FOV", 8, 6, (5.0, 6.0, 4.0, 3.0, 0.9)))
     assert (values["camera_model"], values["fl_x"], values["cy"]) == ("OPENCV", 5.0, 3.0)
     assert values["note"] == "approximation: FOV with parameters [5.0, 6.0, 4.0, 3.0, 0.9] has no counterpart here"

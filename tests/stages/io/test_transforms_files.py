@@ -80,7 +80,7 @@ def test_validation_photos_that_are_not_needed_are_not_read(tmp_path: Path) -> N
         known(tmp_path, train=TRAIN, test=[])
 
 
-def test_the_test_frames_of_a_single_file_are_its_test_photos(tmp_path: Path) -> None:
+def test_test_frames_of_one_file_are_test_photos(tmp_path: Path) -> None:
     file = tmp_path / "transforms.json"
     file.write_text(json.dumps({**LENS, "frames": TRAIN, "test_frames": TEST}))
     found = read_poses(file, PHOTOS, NAMES)

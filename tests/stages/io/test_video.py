@@ -56,7 +56,7 @@ def test_a_browser_can_play_it_while_it_loads(tmp_path: Path) -> None:
     assert b"avc1" in content  # H.264
 
 
-def test_a_video_that_cannot_be_written_is_an_error_with_the_encoders_words(tmp_path: Path) -> None:
+def test_an_unwritable_video_ends_with_the_encoders_words(tmp_path: Path) -> None:
     with refused("io.cannot-write-video", "a.mp4", "No such file or directory"):
         write(tmp_path / "missing/a.mp4", plain_frames() * 200)
 

@@ -56,7 +56,7 @@ def test_an_unseen_component_does_not_set_the_scale():
     assert (cleaned.kept, len(cleaned.surface.faces)) == (1, 4)
 
 
-def test_what_is_far_from_every_sparse_point_goes_and_does_not_set_the_scale():
+def test_surface_far_from_sparse_points_is_removed():
     view, both = visibility_of([5, 5], [5, 5]), tetrahedra(100.0, 1.0)
     on_the_second = both.vertices[4]
     cleaned = clean(both, view, points_at(on_the_second), "visible", 2, 0.01)
@@ -76,7 +76,7 @@ def test_points_far_from_all_of_the_surface_tell_nothing():
     assert clean(tetrahedra(2.0, 1.0), visibility_of([5, 5], [5, 5]), points, "visible", 2, 0.01).kept == 2
 
 
-def test_a_bare_wall_is_not_dropped_for_a_speck_on_it():
+def test_a_bare_wall_survives_a_speck():
     """The wall has points in one corner alone: it stays if they are more than those on the speck."""
     edges, strip = long_strip()
     speck = np.array([[200.0, 0, 0], [201, 0, 0], [200, 1, 0]])
@@ -96,7 +96,7 @@ def test_faces_without_enough_photos_are_cut_before_components_are_counted():
     assert clean(tetrahedra(1.0, 1.0), view, NO_POINTS, "visible", 2, 0.01)[2:] == (1, 0, 7, 0)
 
 
-def test_what_is_hidden_and_far_from_every_sparse_point_is_cut_off():
+def test_hidden_surface_far_from_points_is_removed():
     """A strip of which photos see the first fifth, with points there: the rest hangs on it, a little of it stays."""
     strip = Surface(*long_strip())
     x = strip.vertices[:, 0]

@@ -139,7 +139,7 @@ class Painted(Solid):
         return torch.where(distance < 0, inside, torch.ones(3))
 
 
-def test_colours_are_those_of_what_is_seen_first_not_of_the_emptiness_that_a_vertex_may_lie_in(run_mesh):
+def test_colours_are_those_of_the_first_surface_seen(run_mesh):
     _, folder = run_mesh(Painted(ball, inside=3000.0), max_faces=1500)
     colours = colours_of(trimesh.load_mesh(folder / "mesh.ply", process=False))
     assert (colours[:, :2] < (256, 64)).mean() > 0.99, "not white: what is outside"
@@ -233,7 +233,7 @@ def test_a_part_that_no_sparse_point_locates_is_dropped(run_mesh):
     assert unknown.facts["components_kept"] == 2
 
 
-def test_a_plain_ends_at_the_box_or_where_the_photos_end(run_mesh):
+def test_a_plain_ends_at_box_or_photos(run_mesh):
     result, folder = run_mesh(Solid(plain))
     assert result.facts["watertight"] is False
     assert "open at the edge of the region" in result.line
@@ -288,7 +288,7 @@ def test_a_grid_beyond_memory_is_refused_with_one_that_fits(run_mesh, monkeypatc
     assert error.value.hint == "Try --mesh.resolution 32."
 
 
-def test_the_resolution_that_fits_into_seconds_is_that_of_the_box(run_mesh, monkeypatch):
+def test_resolution_for_seconds_follows_the_box(run_mesh, monkeypatch):
     asked = []
     monkeypatch.setattr(resolution, "reference_seconds", lambda: 0.02)
     monkeypatch.setattr(resolution, "density_query_seconds", lambda train, box: asked.append(box) or 2e-7)

@@ -30,7 +30,7 @@ def shows_all(camera):
 
 
 @pytest.mark.parametrize(("last", "turned"), [((-2, -0.5, 0.4), 180.0), ((0.5, -2.0, 0.2), -90.0)])
-def test_an_object_is_shown_from_a_photos_side_and_as_far_around_as_there_are_photos(last, turned):
+def test_an_object_is_shown_from_the_photos_side(last, turned):
     scene = scene_of("around", [(-0.1, 0, 3), (2, 0.5, 1.1), last])
     one, other = viewpoints(CUBE, scene)
     assert shows_all(one) and shows_all(other)
@@ -42,7 +42,7 @@ def test_an_object_is_shown_from_a_photos_side_and_as_far_around_as_there_are_ph
     np.testing.assert_allclose(-other.from_camera[:, 2], [*around, side[2]], atol=1e-12)
 
 
-def test_what_faces_one_way_is_shown_from_where_the_cameras_stand():
+def test_a_facade_is_shown_from_the_cameras():
     scene = scene_of("forward", [(-1, -3, 0), (0, -3, 0), (1.5, -3, 0)])
     one, other = viewpoints(CUBE, scene)
     assert shows_all(one) and shows_all(other)

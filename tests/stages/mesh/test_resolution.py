@@ -26,7 +26,7 @@ GROUND = np.random.default_rng(0).uniform([-0.8, -0.8, -0.3], [0.8, 0.8, -0.1], 
 FACADE = GROUND[:, [0, 2, 1]] * [1, 1, 0.2]
 
 
-def test_the_resolution_grows_with_the_time_and_falls_with_what_things_take():
+def test_resolution_grows_with_time():
     times = [resolution_within(seconds, 2e-7, 0.02) for seconds in (-5.0, 5.0, 9.0, 12.0, 16.0, 1000.0)]
     assert times == sorted(times) and (times[0], times[-1]) == (64, 256)
     assert all(edge % 16 == 0 for edge in times) and len(set(times)) > 3
@@ -60,7 +60,7 @@ def test_the_yardstick_is_the_best_of_a_few(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize(("points", "flat"), [(GROUND, 2), (FACADE, 1)])
 @pytest.mark.parametrize("capture_type", ["forward", "inside"])
-def test_the_grid_of_a_flat_scene_spans_the_slice_that_its_points_lie_in(points, flat, capture_type):
+def test_a_flat_scenes_grid_spans_its_slice(points, flat, capture_type):
     stray = np.array([[0.1, 0.1, 0.85], [0.5, 0.85, 0.1], [0.0, 0.0, 30.0]])
     box = grid_box(capture_type, np.concatenate([points, stray]))
     ends = np.quantile(points[:, flat], [0, 1]) + np.array([-1, 1]) * 2 * REGION_HALF * MARGIN
@@ -80,7 +80,7 @@ def test_the_grid_of_a_flat_scene_spans_the_slice_that_its_points_lie_in(points,
         (GROUND + np.array([0, 0, 5]), "inside"),
     ],
 )
-def test_the_lattice_spans_the_region_where_points_do_not_tell_that_it_is_flat(points, capture_type):
+def test_the_grid_spans_the_region_without_flat_points(points, capture_type):
     np.testing.assert_array_equal(grid_box(capture_type, points), CUBE)
 
 
@@ -96,6 +96,6 @@ def test_a_flat_box_has_as_many_points_and_smaller_voxels(resolution):
     assert cut == pytest.approx(along**2, rel=2 / resolution)
 
 
-def test_a_flat_scene_has_more_surface_for_its_points_which_takes_time():
+def test_a_flat_scene_costs_more_time_per_point():
     assert expected_seconds(128, 2e-7, 0.02, 2.0) > expected_seconds(128, 2e-7, 0.02)
     assert resolution_within(10.0, 2e-7, 0.02, 3.0) < resolution_within(10.0, 2e-7, 0.02)

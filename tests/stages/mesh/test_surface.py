@@ -81,7 +81,7 @@ def test_area_volume_and_topology_are_those_of_the_solid(distance, area, content
     assert 0 < float(off.mean()) < 0.12 * 1.8 / 63 and float(off.max()) < 0.2 * 1.8 / 63
 
 
-def test_noise_from_one_grid_point_to_the_next_is_not_drawn():
+def test_grid_noise_is_not_drawn():
     clean, random = density_grid_of(ball), torch.Generator().manual_seed(0)
     noisy = clean._replace(values=clean.values * torch.exp(torch.randn(clean.values.shape, generator=random)))
     off = ball(torch.from_numpy(extract_surface(noisy, LEVEL).vertices)) / (1.8 / 63)
@@ -139,7 +139,7 @@ def test_components_are_numbered_by_area():
     np.testing.assert_array_equal(large.faces, TETRAHEDRON.faces)
 
 
-def test_normals_have_unit_length_also_where_faces_cancel_or_are_lost():
+def test_normals_have_unit_length_also_on_lost_faces():
     more = np.concatenate([TETRAHEDRON.vertices, [[9.0, 9, 9], [1, 1, 1]]])
     normals = vertex_normals(Surface(more, np.concatenate([TETRAHEDRON.faces, [[1, 2, 5], [2, 1, 5]]])))
     np.testing.assert_allclose(normals[0], -np.ones(3) / np.sqrt(3))

@@ -54,7 +54,7 @@ def test_one_camera_covers_the_ball_and_sees_its_front(ball, normals):
     assert (visibility.visible[facing < 0.05] == 0).all()
 
 
-def test_the_direction_is_the_cameras_where_seen_and_the_inward_normal_elsewhere(ball, normals):
+def test_directions_are_the_cameras_or_the_inward_normal(ball, normals):
     vertices = RADIUS * normals
     visibility = looked(ball, scene_of((2.5, 0, 0)), vertices, normals)
     towards = vertices - [2.5, 0, 0]

@@ -78,7 +78,7 @@ def run(folders: dict[str, Path], progress, **config):
     return normalise.run(normalise.Config(**config), folders, folders["normalise"], progress)
 
 
-def test_views_are_in_order_of_name_with_their_own_poses_and_observations(inputs, progress) -> None:
+def test_views_keep_names_poses_and_observations_in_order(inputs, progress) -> None:
     folders = inputs()
     result = run(folders, progress)
     scene, points = read_scene(folders["normalise"]), read_tensors(folders["normalise"] / "points.safetensors")
@@ -108,7 +108,7 @@ def test_the_line_says_what_was_decided(inputs, progress) -> None:
 
 
 @pytest.mark.parametrize(("altitude_m", "source"), [(408.0, "GPS"), (None, "level standpoints")])
-def test_up_is_that_of_the_photos_gps_where_it_tells_heights(inputs, progress, altitude_m, source) -> None:
+def test_up_follows_gps_heights(inputs, progress, altitude_m, source) -> None:
     """Photos that are not quite level, half of them with places off by 0.1 m of hundreds."""
     folders = inputs(crooked=True)
     photos = read_photos(folders["ingest"])
@@ -173,7 +173,7 @@ def test_alpha_is_no_background_where_the_scene_goes_on(
 
 
 @pytest.mark.parametrize("opaque", [None, (0.2, 0.3, 0.8, 1.0), (0.0, 0.3, 1.0, 0.9)])
-def test_alpha_is_the_background_of_a_thing_that_is_seen_whole(inputs, progress, opaque: Box | None) -> None:
+def test_alpha_is_the_background_of_a_whole_object(inputs, progress, opaque: Box | None) -> None:
     folders = inputs(transparent=17, opaque=opaque)
     run(folders, progress)
     assert read_scene(folders["normalise"]).has_alpha and progress.notes == []
@@ -213,7 +213,7 @@ def rig(standpoints: int, views: int) -> list[str]:
         (rig(2, 8)[:9], [0, 8]),  # of the second standpoint one is left
     ],
 )
-def test_of_a_rig_not_the_same_view_is_held_out_each_time(names: list[str], held_out: list[int]) -> None:
+def test_a_rig_holds_out_different_views(names: list[str], held_out: list[int]) -> None:
     photos = [Photo(name, f"images/{i}.png", 400, 400, 0, None, None, False, 1.0) for i, name in enumerate(names)]
     split = split_photos(photos, 8, None)
     assert [i for i, part in enumerate(split) if part == "test"] == held_out
@@ -277,7 +277,7 @@ def test_photos_from_one_place_are_refused_with_a_hint(inputs, progress) -> None
         run(inputs(one_place=True), progress)
 
 
-def test_the_bearings_within_a_box_are_those_of_the_pixels_it_touches() -> None:
+def test_rays_within_a_box_match_its_pixels() -> None:
     grid = np.stack(np.meshgrid(np.arange(8.0), np.arange(8.0)), axis=-1)
     rays = np.concatenate([grid, np.ones((8, 8, 1))], axis=-1)  # x is the column, y the row
     found = _within(rays, (0.5, 0.125, 0.76, 0.5))

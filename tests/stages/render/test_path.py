@@ -10,7 +10,7 @@ from tests.refusals import refused
 from tests.stages.render.test_render import CAMERA, scene_with
 
 
-def test_photos_from_near_and_far_are_shown_along_their_own_places_and_lenses() -> None:
+def test_a_near_far_path_follows_poses_and_lenses() -> None:
     test, near, far = ring(1), ring(3, radius=1.5, arc_deg=40.0), ring(4, radius=7.5, arc_deg=20.0)
     scene = scene_with(np.concatenate([test, near, far]))
     lenses = CAMERA, replace(CAMERA, params=(600.0, 600.0, *CAMERA.params[2:]))
@@ -26,7 +26,7 @@ def test_photos_from_near_and_far_are_shown_along_their_own_places_and_lenses() 
     assert {(camera.width, camera.height, camera.params[2:]) for camera in path.cameras} == {(160, 120, (80.0, 60.0))}
 
 
-def test_photos_of_nearly_one_focal_length_are_shown_with_their_median() -> None:
+def test_photos_of_one_focal_length_share_their_median() -> None:
     scene = scene_with(ring(7))
     cameras = tuple(replace(CAMERA, params=(f, f, *CAMERA.params[2:])) for f in (145.0, 150.0, 155.0))
     views = tuple(replace(view, camera=index % 3) for index, view in enumerate(scene.views))

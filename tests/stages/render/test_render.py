@@ -223,7 +223,7 @@ def test_a_written_path_can_be_given_back_as_cameras(inputs, progress, tmp_path:
     assert np.abs(frames.astype(int) - read_video(tmp_path / "first.mp4")[0]).mean() < 1
 
 
-def test_bearings_are_made_frame_by_frame_and_kept_while_the_lens_is_the_same(monkeypatch) -> None:
+def test_ray_directions_are_made_per_frame_and_lens(monkeypatch) -> None:
     """500 lenses at full size would be 12 GB."""
     made = []
 
@@ -262,7 +262,7 @@ def test_a_fisheye_lens_and_a_third_radial_term_are_understood(tmp_path: Path) -
     assert (fisheye.model, fisheye.params[4:]) == ("OPENCV_FISHEYE", (0, 0, 0.01, 0))
 
 
-def test_a_blender_camera_angle_is_understood_and_missing_sizes_are_the_photos(tmp_path: Path) -> None:
+def test_blender_angles_are_understood_without_sizes(tmp_path: Path) -> None:
     frame = {"file_path": "r_0", "transform_matrix": np.eye(4).tolist()}
     camera = given_path({"camera_angle_x": np.pi / 2, "frames": [frame]}, scene_with(ring(5)), tmp_path).cameras[0]
     assert (camera.model, camera.width, camera.height) == ("PINHOLE", 160, 120)
@@ -296,7 +296,7 @@ def test_frames_of_different_size_make_no_video(tmp_path: Path) -> None:
         given_path({"frames": [frame, frame | {"w": 10, "h": 10}]}, scene_with(ring(5)), tmp_path)
 
 
-def test_the_median_camera_has_no_distortion_and_the_photos_angle_of_view() -> None:
+def test_the_median_camera_keeps_the_angle_of_view() -> None:
     scene = scene_with(ring(5))
     camera = median_camera(scene)
     assert camera == Camera("PINHOLE", 160, 120, (150.0, 150.0, 80.0, 60.0))
@@ -314,7 +314,7 @@ def test_the_median_camera_has_no_distortion_and_the_photos_angle_of_view() -> N
         ([(100, 80), (100, 80), (400, 301), (404, 300), (410, 300)], (100, 80)),
     ],
 )
-def test_the_median_camera_has_the_usual_size_or_the_median_of_those_that_are_equally_usual(sizes, size) -> None:
+def test_the_median_camera_has_the_usual_size(sizes, size) -> None:
     cameras = [Camera("PINHOLE", w, h, (150.0, 150.0, w / 2, h / 2)) for w, h in sizes]
     scene = scene_with(ring(1 + len(sizes)))  # the first is a test photo
     views = [replace(view, camera=max(0, index - 1)) for index, view in enumerate(scene.views)]
@@ -384,7 +384,7 @@ def test_a_field_without_exposure_says_nothing_of_it(inputs, progress) -> None:
         ("lark.jpg", 0.5, NEUTRAL, f"no photo lark.jpg has a camera: {NEUTRAL}; perhaps dark.jpg"),
     ],
 )
-def test_a_photo_without_exposure_of_its_own_is_no_error_after_the_training(
+def test_missing_exposure_is_no_error_after_training(
     inputs, progress, monkeypatch, like: str, level: float, exposure: str, note: str
 ) -> None:
     with_exposure(inputs, monkeypatch)

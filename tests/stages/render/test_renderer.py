@@ -72,7 +72,7 @@ def test_training_took_as_long_as_its_curve_says(tmp_path: Path) -> None:
     assert trained_seconds(tmp_path) == 61.5
 
 
-def test_pictures_have_what_is_left_of_the_time_given_or_a_share_of_the_trainings(tmp_path: Path) -> None:
+def test_images_have_a_share_of_the_time_given(tmp_path: Path) -> None:
     write_json(tmp_path / "curve.json", {"points": [{"seconds": 50.0}]})
     assert Allowance(None, tmp_path, 3.0).left() == 15.0
     assert 5 < Allowance(10.0, tmp_path, 3.0).left() <= 7

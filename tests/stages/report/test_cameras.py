@@ -95,7 +95,7 @@ def test_of_a_large_group_the_first_photos_are_shown() -> None:
     assert (group.files, group.more) == (files(20)[:MAX_SHOWN], 20 - MAX_SHOWN)
 
 
-def test_many_weak_links_are_shown_largest_first_and_the_rest_together() -> None:
+def test_weak_links_are_shown_largest_first() -> None:
     groups = camera_report(registration(check=check(weak_links=weak(1, 2, 3, 4, 5, 6, 1))), {}).groups
     assert [len(group.files) + group.more for group in groups] == [6, 5, 4, 3, 1 + 2 + 1]
 

@@ -9,7 +9,7 @@ from stages.io.files import write_json
 from tests.stages.report.report_workspace import make_workspace, written
 
 
-def test_page_shows_both_scores_of_right_halves_with_what_they_mean(tmp_path: Path, progress: Any):
+def test_page_shows_both_scores_of_right_halves(tmp_path: Path, progress: Any):
     inputs = make_workspace(tmp_path)
     html, _ = written(inputs, tmp_path / "out", progress)
     assert "right half, exposure fitted on the left (dB)</th>" in html

@@ -37,7 +37,7 @@ def test_the_order_of_three_pictures_is_told_where_they_are(inputs: dict[str, Pa
     assert places == sorted(places)
 
 
-def test_where_not_all_test_photos_are_scored_not_all_are_shown(tmp_path: Path, progress: Any):
+def test_scored_and_shown_photos_may_be_some(tmp_path: Path, progress: Any):
     inputs = make_workspace(tmp_path)
     path = inputs["evaluate"] / "metrics.json"
     metrics = json.loads(path.read_text("utf-8")) | {"photos_test": 9}
@@ -62,16 +62,14 @@ def test_files_beside_the_page_are_named(tmp_path: Path, progress: Any):
     assert "pass on both" not in written(inputs, tmp_path / "small", progress)[0]
 
 
-def test_long_names_of_photos_are_broken_and_do_not_widen_the_page(
-    inputs: dict[str, Path], tmp_path: Path, progress: Any
-):
+def test_long_photo_names_are_broken(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     html, _ = written(inputs, tmp_path / "out", progress)
     assert ".names td { overflow-wrap: anywhere; }" in html
     for head in ("<th>photo</th><th>why</th>", "<th>file</th><th>why</th>"):
         assert f'<table class="names">\n<thead><tr>{head}' in html
 
 
-def test_the_curve_s_photos_are_those_above_where_there_are_any(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+def test_the_curves_photos_are_those_above(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     words = "Held-out photos are the test photos above"
     assert words in written(inputs, tmp_path / "out", progress)[0]
     unmeasured = {stage: folder for stage, folder in inputs.items() if stage != "evaluate"}

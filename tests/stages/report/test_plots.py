@@ -67,7 +67,7 @@ def test_plots_of_one_page_share_no_identifier():
     assert len(together) == len(set(together))
 
 
-def test_the_curve_shows_what_comes_next_and_where_the_knee_is():
+def test_the_curve_shows_prediction_and_knee():
     steep = curve_svg(_curve(), {}, coming_doubling("grid", True, _curve())) or ""
     assert "predicted" in steep and "knee" not in steep
     flat = [row | {"heldout_psnr": 20 - 8 / row["seconds"]} for row in _curve()]
@@ -100,7 +100,7 @@ def test_the_prediction_lies_inside_the_plot(monkeypatch: pytest.MonkeyPatch):
     assert curve[-1]["heldout_psnr"] + 8.5 <= tops[0] < 40
 
 
-def test_cameras_plot_says_which_way_is_up_only_where_it_is_known():
+def test_the_cameras_plot_says_up_where_known():
     scene = _scene()
     blind = Scene(scene.cameras, scene.views, scene.scene_from_sfm, True, False, "around", False)
     points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
@@ -116,7 +116,7 @@ def _drawn(views: Sequence[View], joined: bool, monkeypatch: pytest.MonkeyPatch)
     return drawn[0]
 
 
-def test_each_camera_is_joined_to_the_next_by_name_and_has_the_colour_of_its_place(monkeypatch: pytest.MonkeyPatch):
+def test_cameras_are_joined_and_coloured_by_order(monkeypatch: pytest.MonkeyPatch):
     by_number = [replace(view, name=f"IMG_{8 + i}.jpg") for i, view in enumerate(_scene().views)]  # 8, 9, 10, …
     centres = np.array([view.scene_from_camera[:2, 3] for view in by_number])
     _, joins, outlines, test = _drawn(by_number[::-1], True, monkeypatch).collections
@@ -128,7 +128,7 @@ def test_each_camera_is_joined_to_the_next_by_name_and_has_the_colour_of_its_pla
     assert np.allclose(np.asarray(test.get_offsets()), centres[[0, 8]]), "test photos have a dot"
 
 
-def test_no_line_leads_from_folder_to_folder_nor_where_names_tell_no_order(monkeypatch: pytest.MonkeyPatch):
+def test_no_line_joins_folders_or_unordered_names(monkeypatch: pytest.MonkeyPatch):
     views = [replace(view, name=f"{'ab'[i // 5]}/{i}.jpg") for i, view in enumerate(_scene().views)]
     for joined, count in ((True, 7), (False, 0)):
         joins, outlines = _drawn(views, joined, monkeypatch).collections[1:3]
@@ -136,7 +136,7 @@ def test_no_line_leads_from_folder_to_folder_nor_where_names_tell_no_order(monke
         assert (len(joins.get_segments()), len(outlines.get_segments())) == (count, 9)
 
 
-def test_a_camera_outline_starts_at_its_centre_and_opens_by_its_field_of_view():
+def test_a_camera_outline_opens_by_its_field_of_view():
     scene = _scene()
     view = scene.views[3]
     outline = _outline(scene, view, 0.5)

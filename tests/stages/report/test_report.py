@@ -86,7 +86,7 @@ def test_a_budget_is_shown_promised_beside_spent_and_in_all(inputs: dict[str, Pa
     assert "Given 5 min" not in written(inputs, tmp_path / "without", progress)[0]
 
 
-def test_without_a_budget_what_was_expected_stands_beside_what_was_spent(tmp_path: Path, progress: Any):
+def test_without_a_budget_expected_stands_beside_spent(tmp_path: Path, progress: Any):
     inputs = make_workspace(tmp_path)
     for stage, seconds in (("sfm", 50.0), ("train", 184.0), ("mesh", None)):
         manifest = read_json(inputs[stage] / "manifest.json")
@@ -132,7 +132,7 @@ def test_page_is_the_same_twice_and_gives_no_folder_away(inputs: dict[str, Path]
     assert "pipeline resume fox.nerf" in html
 
 
-def test_page_tells_what_a_person_wants_to_know_in_that_order(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+def test_page_answers_questions_in_order(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     html, _ = written(inputs, tmp_path / "out", progress)
     story = [
         "Better than any photo nearby by 7.3 dB but soft.",
@@ -300,7 +300,7 @@ def test_transparent_photos_are_shown_as_they_were_scored():
     assert page._opaque(pixels[..., :3], 255).tolist() == [[[200, 100, 0]] * 3]
 
 
-def test_a_finished_stage_that_lost_a_file_is_an_error_with_its_name(tmp_path: Path, progress: Any):
+def test_a_finished_stage_lacking_a_file_is_named(tmp_path: Path, progress: Any):
     inputs = make_workspace(tmp_path)
     (inputs["train"] / "curve.json").unlink()
     with refused("io.damaged-json", "curve.json"):

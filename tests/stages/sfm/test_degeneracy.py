@@ -38,7 +38,7 @@ def sizes(count: int) -> np.ndarray:
     return np.tile(SIZE, (count, 2, 1))
 
 
-def test_a_turn_is_a_rotation_with_the_right_focal_length_only() -> None:
+def test_a_turn_is_a_rotation_at_the_right_focal() -> None:
     assert departure_from_rotation(homographies(0), sizes(4), 0.8).max() < 1e-9
     assert departure_from_rotation(homographies(0)[:2], sizes(2), 1.6).min() > MAX_ROTATION_DEPARTURE
 
@@ -75,7 +75,7 @@ def fundamental(step: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("step", "inside"), [(AHEAD, True), (BACK_AND_UP, True), (ASIDE, False)])
-def test_a_camera_that_moves_ahead_has_its_epipoles_in_the_picture(step: np.ndarray, inside: bool) -> None:
+def test_forward_motion_has_epipoles_in_the_picture(step: np.ndarray, inside: bool) -> None:
     found = epipoles_inside(np.array([fundamental(step, turn(3, axis)) for axis in range(3)]), sizes(3))
     assert found.tolist() == [inside] * 3
 

@@ -89,7 +89,7 @@ def test_strategies_skipped_for_time_are_counted() -> None:
     assert skipped_for_time([{"skipped": reason} for reason in reasons]) == 3
 
 
-def test_a_run_that_goes_on_knows_what_the_one_before_it_took(
+def test_a_resumed_run_knows_its_earlier_time(
     synthetic_photos: SyntheticPhotos, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pictures = sorted(synthetic_photos.folder.iterdir())[:6]

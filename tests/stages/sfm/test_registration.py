@@ -85,9 +85,7 @@ def test_a_photo_whose_camera_cannot_be_used_has_that_reason() -> None:
         ((40, 35), "its pose is not sure: 35 of its 40 features that are points of the model agree on one"),
     ],
 )
-def test_a_photo_that_shares_views_with_the_model_has_too_little_to_stand_on(
-    support: tuple[int, int], why: str
-) -> None:
+def test_a_photo_with_few_shared_views_is_told(support: tuple[int, int], why: str) -> None:
     assert reasons(*FOUR, d=support)["d"] == why
 
 
@@ -122,7 +120,7 @@ def test_groups_that_contradict_each_other_are_named() -> None:
     )
 
 
-def test_a_photo_may_share_no_view_or_belong_to_another_group() -> None:
+def test_a_photo_may_be_alone_or_of_another_group() -> None:
     told = reasons(matches((0, 1), (2, 3)), [["a.jpg", "b.jpg"], ["c.jpg"]])
     assert told == {
         "a": None,

@@ -103,7 +103,7 @@ def is_gone(pid: int) -> bool:
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for the child in /proc")
-def test_a_killed_run_takes_its_child_along_and_goes_on_to_the_same_bytes(
+def test_a_killed_run_ends_its_worker_and_resumes_identically(
     inputs: dict[str, Path], reconstructed: Path, tmp_path: Path, progress
 ) -> None:
     parent = subprocess.Popen([sys.executable, "-c", PROGRAM, str(inputs["ingest"]), str(tmp_path)], cwd=ROOT)
@@ -145,9 +145,7 @@ def test_however_the_child_ends_it_is_an_error_with_words(
     assert (tmp_path / "sfm.log").exists()
 
 
-def test_strangers_are_left_out_and_named_and_alpha_and_mixed_sizes_work(
-    inputs: dict[str, Path], tmp_path: Path, progress
-) -> None:
+def test_strangers_are_named_alpha_and_mixed_sizes_work(inputs: dict[str, Path], tmp_path: Path, progress) -> None:
     images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:8]}
     alpha = {f"{n}.png": np.dstack([i, np.full(i.shape[:2], 255, np.uint8)]) for n, i in list(images.items())[:6]}
     plain = dict(list(images.items())[6:]) | {"stranger.png": blots(1, 300, 200)}
@@ -175,7 +173,7 @@ def test_strangers_are_left_out_and_named_and_alpha_and_mixed_sizes_work(
     assert account["repeated_structure"] is None
 
 
-def test_nearly_the_same_pictures_are_not_matched_and_masks_keep_features_away(
+def test_near_duplicates_are_unmatched_and_masks_exclude_features(
     inputs: dict[str, Path], tmp_path: Path, progress
 ) -> None:
     images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:9]}
@@ -248,7 +246,7 @@ def test_photos_with_gps_tell_metres_and_directions(
 
 
 @pytest.mark.parametrize("always", [False, True], ids=["mended", "left out"])
-def test_the_camera_of_one_photo_that_comes_out_degenerate_does_not_end_the_run(
+def test_one_degenerate_camera_does_not_end_the_run(
     always: bool, inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:8]}

@@ -61,9 +61,7 @@ def test_nothing_on_the_front_is_beaten_and_all_else_is(found: list[tuple[float,
 
 
 @given(places, st.floats(0, 1))
-def test_what_is_recommended_is_on_the_front_and_nothing_later_pays(
-    found: list[tuple[float, float]], spread: float
-) -> None:
+def test_the_recommended_run_is_on_the_front(found: list[tuple[float, float]], spread: float) -> None:
     front = pareto_front([point(*place, spread=spread) for place in found])
     index = recommended_index(front)
     chosen = front[index]
@@ -78,7 +76,7 @@ def test_the_cheapest_point_after_which_no_doubling_pays() -> None:
     assert recommended_index(doublings(gains, spread=1.0)) == 2, "0.9 dB of which 1.4 may be chance is no gain"
 
 
-def test_a_flat_stretch_before_a_gain_does_not_end_the_search() -> None:
+def test_a_flat_stretch_does_not_end_the_search() -> None:
     """A later point may pay for the doublings before it."""
     assert recommended_index(doublings([2.0, 0.1, 2.0, 0.1])) == 3
 
@@ -149,7 +147,7 @@ FOX_GRID += [(30.4, 27.72, 0.03), (48.9, 29.26, 0.05)]
 FOX_VANILLA = [(26.8, 18.79, 0.84), (27.3, 18.91, 0.88)]
 
 
-def test_what_hardly_begun_trainings_differ_by_is_no_noise_of_long_ones() -> None:
+def test_short_trainings_spread_is_no_noise_of_long_ones() -> None:
     points = [point(s, psnr, seeds=2, psnr_std=d, downscale=4.0) for s, psnr, d in FOX_GRID]
     points += [point(s, psnr, seeds=2, psnr_std=d, variant="vanilla, reduced") for s, psnr, d in FOX_VANILLA]
     points.append(point(83.7, 30.48, downscale=4.0))
@@ -161,7 +159,7 @@ def test_what_hardly_begun_trainings_differ_by_is_no_noise_of_long_ones() -> Non
     assert "30.5 ± 0.1 dB" in said.words and "within the spread" not in said.words
 
 
-def test_the_spread_of_one_kind_of_field_is_not_that_of_another_unless_nothing_else_is_known() -> None:
+def test_one_fields_spread_is_not_anothers() -> None:
     grid, vanilla = (
         point(10, 20, seeds=4, psnr_std=0.1),
         point(10, 15, seeds=4, psnr_std=1.0, variant="vanilla, reduced"),
@@ -235,7 +233,7 @@ def test_the_recommendation_changes_with_the_scene_whatever_the_workspace_has() 
     assert "no field of its kind was trained for longer than 1 min 20 s" in late.words
 
 
-def test_more_time_is_not_asked_for_where_it_did_not_help() -> None:
+def test_more_time_is_not_advised_without_gain() -> None:
     worse = recommend([*doublings([3.0]), point(90, 22.5)])
     assert worse.point.train_seconds == 20 and not worse.still_rising
     assert "Nothing tried is better: longer trainings were no better." in worse.words and "--budget" not in worse.words
@@ -249,13 +247,13 @@ def test_more_time_is_not_asked_for_where_it_did_not_help() -> None:
     assert other_kind.still_rising, "what a vanilla NeRF does tells nothing of a grid"
 
 
-def test_the_point_of_the_front_that_is_drawn_fastest_is_marked() -> None:
+def test_the_fastest_point_of_the_front_is_marked() -> None:
     points = [point(10, 20, frame_seconds=3.0), point(15, 19, frame_seconds=0.5), point(20, 23, frame_seconds=1.0)]
     rows = table(points)
     assert [row["fastest_to_render"] for row in rows] == [False, False, True], "the fastest of all is beaten"
 
 
-def test_the_spread_weighs_settings_by_their_seeds_and_takes_no_more_than_it_needs() -> None:
+def test_the_spread_weighs_settings_by_seeds() -> None:
     points = [point(1, 20, seeds=2, psnr_std=1.0), point(2, 20, seeds=4, psnr_std=0.5)]
     assert pooled_spread(points[0], points) == pytest.approx(((1 * 1 + 3 * 0.25) / 4) ** 0.5)
     assert pooled_spread(points[1], points) == pytest.approx(0.5), "three degrees of freedom of its own"

@@ -48,7 +48,7 @@ def test_every_variant_is_one_that_stage_train_takes(space: Space) -> None:
 
 
 @SPACES
-def test_a_study_has_the_sizes_of_grids_that_training_has_for_long_and_for_short_runs(space: Space) -> None:
+def test_a_study_uses_training_grid_sizes(space: Space) -> None:
     def sizes(variant: str) -> tuple[int, ...]:
         return tuple(
             train_options(variant, space)["grid"][name] for name in ("num_levels", "log2_hashmap_size", "max_res")
@@ -82,7 +82,7 @@ def test_every_variant_is_explained_with_its_sizes(space: Space) -> None:
         assert words in DESCRIPTIONS[name] and f"{sizes['batch_rays']:,} rays a step" in DESCRIPTIONS[name]
 
 
-def test_with_time_enough_nothing_is_left_out_and_each_arm_is_there_once() -> None:
+def test_with_time_enough_every_run_is_there_once() -> None:
     plenty = {name: Speed(1e4, 1e8) for name in TIMED}
     runs, left_out = make_schedule(1e4, 1, "bounded", SIZES, plenty, 0)
     assert not left_out
@@ -116,7 +116,7 @@ def planned(seconds: float, sizes: tuple[float, ...], reading: float, drawn: flo
     ids=["lego", "fox", "500 photos", "tiny photos"],
 )
 @pytest.mark.parametrize("seconds", [600.0, 1320.0, 1800.0, 7200.0])
-def test_a_study_on_two_cores_has_what_it_is_made_for(seconds: float, sizes: tuple[float, ...], reading: float) -> None:
+def test_a_study_on_two_cores_is_complete(seconds: float, sizes: tuple[float, ...], reading: float) -> None:
     made = planned(seconds, sizes, reading)
     assert 0.8 * seconds < made.seconds <= seconds
     seeds: dict[tuple[str, float, int], int] = {}
@@ -135,26 +135,26 @@ def test_a_study_on_two_cores_has_what_it_is_made_for(seconds: float, sizes: tup
         assert any(s[0] == FEWER_RAYS for s in seeds)
 
 
-def test_the_methods_trainings_are_longer_than_most_and_none_is_hardly_begun() -> None:
+def test_vanilla_trainings_are_the_longer_ones() -> None:
     runs = planned(1320.0, (1.0, 2.0, 4.0), 0.2).runs
     steps = {run.variant: run.steps for run in runs if run.variant in (REDUCED, *ABLATIONS)}
     assert set(steps.values()) == {round_to_two_digits(1320 * LONGEST_RUN / LEVEL_RATIO * CORES[REDUCED].steps)}
     assert min(run.steps / CORES["grid"].steps for run in runs if run.variant == "grid") > 4, "seconds"
 
 
-def test_a_slowly_drawn_field_is_scored_on_fewer_pixels_and_still_takes_no_sixth_of_the_time() -> None:
+def test_slow_fields_are_scored_on_fewer_pixels() -> None:
     (run,) = [run for run in planned(1320.0, (1.0, 2.0, 4.0), 0.2).runs if run.variant == FEWER_RAYS]
     assert run.stride == SCORING_STRIDE and run.steps >= MIN_STEPS and run.seconds < 1320 / 6
     assert {a.stride for a in planned(1320.0, (1.0, 2.0, 4.0), 0.2).runs if a.variant != FEWER_RAYS} == {1}
 
 
-def test_where_there_is_time_for_it_the_published_networks_have_their_rays() -> None:
+def test_published_networks_have_their_rays_given_time() -> None:
     gpu = CORES | {PUBLISHED: Speed(20.0, 20e3), FEWER_RAYS: Speed(60.0, 4e3)}
     variants = {run.variant for run in make_schedule(1320.0, 3, "bounded", SIZES, gpu, 1e5).runs}
     assert PUBLISHED in variants and FEWER_RAYS not in variants
 
 
-def test_the_first_training_at_a_size_reads_the_photos_and_the_study_those_of_its_windows() -> None:
+def test_a_first_training_at_a_size_reads_photos() -> None:
     runs = make_schedule(600, 1, "bounded", SIZES, FAST, 1000).runs
     told = make_schedule(600, 1, "bounded", SIZES, FAST, 1000, ReadingTime(photos=5.0, crops=7.0)).runs
     more = {run.name: run.seconds for run in told}
@@ -203,7 +203,7 @@ def test_photo_sizes_are_distinct_and_not_tiny(
     assert photo_sizes(chosen, largest, longer_side) == sizes
 
 
-def test_half_and_twice_the_samples_take_as_many_steps_and_their_part_of_the_time() -> None:
+def test_half_and_twice_the_samples_keep_steps() -> None:
     runs = {run.variant: run for run in make_schedule(1e4, 1, "bounded", SIZES, FAST, 0).runs}
     half, twice = runs["vanilla, half the samples"], runs["vanilla, twice the samples"]
     assert half.steps == twice.steps

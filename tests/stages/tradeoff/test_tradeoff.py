@@ -71,7 +71,7 @@ class Killed(BaseException):
     """Stands for kill -9."""
 
 
-def test_a_study_from_arms_to_recommendation_and_the_same_after_a_kill(
+def test_a_study_is_the_same_after_a_kill(
     tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     result = studied(tmp_path / "whole", photos, progress)
@@ -123,7 +123,7 @@ def test_what_is_planned_is_what_is_run(tmp_path: Path, photos: dict[str, Path],
 
 
 @pytest.mark.parametrize("unbounded, space", [(False, "bounded"), (True, "contracted")])
-def test_a_study_is_of_the_space_that_the_scene_lies_in(
+def test_a_study_keeps_the_scenes_space(
     tmp_path: Path,
     photos: dict[str, Path],
     progress: Any,
@@ -200,7 +200,7 @@ def test_what_a_killed_attempt_took_is_time_of_the_study(
     assert not any("slower" in note for note in progress.notes), "the kill took the time"
 
 
-def test_a_study_whose_killed_attempts_took_all_its_time_still_has_a_result(
+def test_a_study_out_of_time_still_has_a_result(
     tmp_path: Path, photos: dict[str, Path], progress: Any, now: list[float]
 ) -> None:
     for _ in range(3):
@@ -211,9 +211,7 @@ def test_a_study_whose_killed_attempts_took_all_its_time_still_has_a_result(
     assert len(read_json(tmp_path / "tradeoff.json")["runs"]) == 1
 
 
-def test_the_field_of_the_workspace_is_a_point_and_no_output(
-    tmp_path: Path, photos: dict[str, Path], progress: Any
-) -> None:
+def test_the_workspaces_field_is_a_point_without_output(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
     own = tmp_path / "train" / "0123456789abcdef"
     own.mkdir(parents=True)
     facts = train.run(train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, own, progress).facts
@@ -232,7 +230,7 @@ def test_the_field_of_the_workspace_is_a_point_and_no_output(
     assert "This workspace's field (" in text and "this workspace's field ★ |" in text
 
 
-def test_the_field_of_the_workspace_is_scored_on_some_pixels_where_it_is_drawn_slowly_and_that_is_said(
+def test_the_workspaces_slow_field_is_scored_on_some_pixels(
     tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own, kind = tmp_path / "train" / "0123456789abcdef", VanillaOptions(**TINY["vanilla"])
@@ -256,9 +254,7 @@ def test_the_field_of_the_workspace_is_scored_on_some_pixels_where_it_is_drawn_s
     assert "; this workspace's field: one in 4 of their rows and columns, to save time" in scored
 
 
-def test_a_field_that_is_drawn_slowly_is_scored_on_some_pixels_of_the_same_windows(
-    tmp_path: Path, photos: dict[str, Path], progress: Any
-) -> None:
+def test_a_slow_field_is_scored_on_the_same_crops(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
     scene = read_scene(photos["normalise"])
     train.run(train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, tmp_path, progress)
     crops = benchmark.make_benchmark(photos["ingest"], scene, 1.0, 4, 1.0)
@@ -267,9 +263,7 @@ def test_a_field_that_is_drawn_slowly_is_scored_on_some_pixels_of_the_same_windo
     assert 0 < abs(whole["psnr"] - thinned["psnr"]) < 2
 
 
-def test_a_field_trained_over_black_is_scored_over_what_the_photos_are_over(
-    tmp_path: Path, photos: dict[str, Path], progress: Any
-) -> None:
+def test_fields_are_scored_over_the_photos_background(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
     white, black = tmp_path / "white", tmp_path / "black"
     white.mkdir()
     train.run(train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, white, progress)
@@ -282,7 +276,7 @@ def test_a_field_trained_over_black_is_scored_over_what_the_photos_are_over(
     assert scores[0] == scores[1]
 
 
-def test_an_arm_that_does_not_learn_is_said_and_the_study_goes_on(
+def test_a_run_that_does_not_learn_is_told(
     tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = train.run
@@ -304,7 +298,7 @@ def test_an_arm_that_does_not_learn_is_said_and_the_study_goes_on(
     assert any("no result (training diverged: it was told to)" in note for note in progress.notes)
 
 
-def test_want_of_memory_ends_the_study_which_goes_on_with_that_training(
+def test_lack_of_memory_ends_and_resumes_the_study(
     tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole, asked = train.run, list[int]()
@@ -329,7 +323,7 @@ def test_want_of_memory_ends_the_study_which_goes_on_with_that_training(
     assert not any(run["failed"] for run in read_json(tmp_path / "tradeoff.json")["runs"])
 
 
-def test_what_counts_as_an_arms_own_fault_is_what_training_says() -> None:
+def test_a_runs_own_fault_is_what_training_says() -> None:
     said = "".join((Path(train.__file__).parent / f"{name}.py").read_text() for name in ("loop", "data"))
     assert all(f'"{what}"' in said for what in benchmark.RUN_FAILURES)
 

@@ -46,7 +46,7 @@ def test_of_a_finished_run_nothing_is_removed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("harm", ["cut tensors", "flipped bit", "cut json", "no tensors", "empty json"])
-def test_a_damaged_one_is_named_and_the_one_before_is_used(tmp_path: Path, harm: str) -> None:
+def test_a_damaged_checkpoint_is_named_and_skipped(tmp_path: Path, harm: str) -> None:
     saved(tmp_path, 3, 4)
     tensors, meta = tmp_path / "000000004.safetensors", tmp_path / "000000004.json"
     if harm == "cut tensors":
@@ -69,7 +69,7 @@ def test_a_damaged_one_is_named_and_the_one_before_is_used(tmp_path: Path, harm:
     assert latest_checkpoint(tmp_path, pytest.fail) is not None
 
 
-def test_a_kill_before_the_json_leaves_no_checkpoint_and_its_rest_is_swept_up(tmp_path: Path) -> None:
+def test_a_kill_before_the_json_leaves_no_checkpoint(tmp_path: Path) -> None:
     saved(tmp_path, 1)
     (tmp_path / "000000002.safetensors").write_bytes(b"half")
     (tmp_path / "000000002.json.tmp").write_bytes(b"{")
@@ -116,9 +116,7 @@ def test_a_checkpoint_under_another_step_does_not_pass(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("fault", [RuntimeError("another field"), TypeError("an unknown fact")])
-def test_one_that_belongs_to_something_else_is_named_and_the_one_before_is_used(
-    tmp_path: Path, fault: Exception
-) -> None:
+def test_a_checkpoint_of_something_else_is_named_and_skipped(tmp_path: Path, fault: Exception) -> None:
     saved(tmp_path, 3, 4)
     said: list[str] = []
 

@@ -8,7 +8,7 @@ from stages.train.curve import doubling_words, next_words, ssim_words
 POINTS = [{"seconds": 10.0 * 2**k, "heldout_psnr": 20.0 + k} for k in range(5)]
 
 
-def test_the_last_doubling_and_the_next_are_those_of_training_time() -> None:
+def test_doublings_are_of_training_time() -> None:
     last = "the last doubling of training time, to 2 min 40 s, bought +1.0 dB on held-out photos"
     assert doubling_words(POINTS, None) == last
     less = "(less over a run of half the time, which would have ended above this curve)"

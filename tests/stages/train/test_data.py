@@ -60,7 +60,7 @@ def test_a_views_rays_go_through_its_pixel_centres(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("downscale", [1.0, 2.0, 3.3])
-def test_the_bank_and_the_views_are_the_same_pixels_and_rays(
+def test_the_ray_dataset_has_the_views_pixels_and_rays(
     downscale: float, tmp_path: Path, progress: SilentProgress
 ) -> None:
     inputs, scene = photographed(tmp_path)
@@ -86,9 +86,7 @@ def test_transparent_pixels_are_shown_over_the_background(tmp_path: Path, progre
 
 
 @pytest.mark.parametrize("downscale", [1.0, 2.0])
-def test_alpha_that_is_no_background_is_ignored_like_what_a_mask_ignores(
-    downscale: float, tmp_path: Path, progress: SilentProgress
-) -> None:
+def test_ignored_alpha_is_like_a_mask(downscale: float, tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=4)
     write_png(inputs["ingest"] / "opaque/all.png", ball_photo(4)[..., 3].copy())
     views = tuple(replace(view, mask="opaque/all.png") for view in scene.views)
@@ -103,7 +101,7 @@ def test_alpha_that_is_no_background_is_ignored_like_what_a_mask_ignores(
     assert view_mask(inputs["ingest"], scene, scene.views[1], downscale) is None
 
 
-def test_an_opaque_photo_in_a_scene_with_alpha_covers_every_pixel(tmp_path: Path, progress: SilentProgress) -> None:
+def test_an_opaque_photo_covers_every_pixel(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=3)
     dataset = training_dataset(inputs["ingest"], replace(scene, has_alpha=True), "train", 1.0, progress)
     assert dataset.pixels.shape[1] == 4
@@ -133,9 +131,7 @@ def test_evaluation_reads_the_pixels_that_training_stored(tmp_path: Path, progre
         assert torch.equal(reader.pixels(view, WHITE), pixels)
 
 
-def test_where_photos_are_stored_is_found_out_once_for_each_split(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pixel_store_is_asked_once_a_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def found_out(ingest: Path, name: str, *rest: Any) -> PixelStore:
         asked.append(name)
         return pixel_store(ingest, name, *rest)
@@ -151,7 +147,7 @@ def test_where_photos_are_stored_is_found_out_once_for_each_split(
 
 @pytest.mark.parametrize("downscale", [1.0, 8.0])
 @pytest.mark.parametrize("has_alpha", [True, False])  # of the scene: where it has none, that of photos is dropped
-def test_how_many_photos_are_decoded_at_a_time_follows_from_what_their_files_hold(
+def test_parallel_decoding_follows_the_files_sizes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, progress: SilentProgress, has_alpha: bool, downscale: float
 ) -> None:
     def pool(workers: int) -> ThreadPoolExecutor:
@@ -297,7 +293,7 @@ def test_points_guide_once_two_training_photos_saw_them(tmp_path: Path, progress
         assert (0 if dataset.known is None else len(dataset.known)) == known
 
 
-def test_points_on_the_rim_of_what_alpha_shows_are_no_guide(tmp_path: Path, progress: SilentProgress) -> None:
+def test_points_on_the_rim_of_alpha_are_no_guide(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=4)
     dataset, opaque = (guided_dataset(inputs, each, 1.0, progress) for each in (scene, replace(scene, has_alpha=False)))
     assert dataset.known is not None and opaque.known is not None

@@ -50,7 +50,7 @@ def non_finite(at: int, until_rate: float) -> Callable[[int], OneNumber]:
     return lambda attempt: OneNumber(attempt, trouble)
 
 
-def test_a_non_finite_step_is_rolled_back_at_half_the_rate(tmp_path: Path, progress) -> None:
+def test_a_non_finite_step_is_rolled_back(tmp_path: Path, progress) -> None:
     run = run_in(tmp_path, progress, make=non_finite(at=25, until_rate=0.3))
     run.train()
     assert run.state.rollbacks == 2
@@ -141,7 +141,7 @@ def test_what_was_measured_of_steps_taken_back_is_forgotten(
     assert [point["step"] for point in run.state.curve] == [10, 15, 21, 29, 40]
 
 
-def test_a_field_that_more_steps_made_good_is_no_longer_of_no_use(tmp_path: Path, progress) -> None:
+def test_a_field_improved_by_more_steps_is_of_use(tmp_path: Path, progress) -> None:
     first = run_in(tmp_path / "first", progress, make=dying(1, 0.0, 0.5))
     first.train()
     assert first.state.symptom == "it is empty (mean opacity 0e+00)"
@@ -172,7 +172,7 @@ def finished(folder: Path, progress, steps: int = 40) -> Path:
     return folder
 
 
-def test_more_steps_begin_where_the_finished_run_ended_at_the_longer_run_s_rates(tmp_path: Path, progress) -> None:
+def test_more_steps_begin_at_the_longer_runs_rates(tmp_path: Path, progress) -> None:
     first = finished(tmp_path / "first", progress)
     before = {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
     longer = run_in(tmp_path / "more", progress, TrainingBudget(20, None, first))
@@ -248,7 +248,7 @@ def test_a_target_ends_the_run_once_it_is_reached(tmp_path: Path, progress) -> N
     assert run.plan.total_steps == run.state.step == run.state.curve[-1]["step"]
 
 
-def test_a_target_out_of_reach_takes_the_whole_budget_and_ends_annealed(tmp_path: Path, progress) -> None:
+def test_an_unreachable_target_takes_the_whole_budget(tmp_path: Path, progress) -> None:
     run = towards(tmp_path, progress, 30.0)
     assert run.state.step == 1000 and reasons(run) == ["begin"]
     assert run.state.validation_psnr == pytest.approx(22.0, abs=0.1)
@@ -285,7 +285,7 @@ def test_a_target_that_was_reached_does_not_end_more_steps(tmp_path: Path, progr
     assert more.state.open_target(20.0) is None and first.state.open_target(20.0) == 20.0
 
 
-def test_more_steps_towards_a_higher_target_anneal_as_if_none_had_been(tmp_path: Path, progress) -> None:
+def test_a_higher_target_anneals_as_if_new(tmp_path: Path, progress) -> None:
     first = towards(tmp_path / "first", progress, 20.0)
     more = more_towards(tmp_path / "more", progress, 20.8, tmp_path / "first")
     assert more.state.validation_psnr is not None and 20.8 <= more.state.validation_psnr < 21.1
@@ -295,7 +295,7 @@ def test_more_steps_towards_a_higher_target_anneal_as_if_none_had_been(tmp_path:
 
 
 @pytest.mark.parametrize("at", [70, 225, 250])
-def test_a_run_to_a_target_in_two_pieces_is_the_same(at: int, tmp_path: Path, progress) -> None:
+def test_a_target_run_in_two_pieces_is_the_same(at: int, tmp_path: Path, progress) -> None:
     class Mortal(Rising):
         def step(self, step: int, progress: float, lr_scale: float) -> StepResult:
             if step == at:

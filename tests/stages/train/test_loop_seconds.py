@@ -15,7 +15,7 @@ from stages.train.state import Pace, TrainingBudget, checkpoint_interval
 from tests.stages.train.one_number import Killed, OneNumber, killed_at, number_of, run_in, slow
 
 
-def test_a_run_in_seconds_takes_about_that_long_and_its_share_ends_at_1(tmp_path: Path, progress) -> None:
+def test_a_run_in_seconds_ends_at_full_progress(tmp_path: Path, progress) -> None:
     run = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
     run.train()
     assert 0.2 < run.state.seconds < 0.5
@@ -25,7 +25,7 @@ def test_a_run_in_seconds_takes_about_that_long_and_its_share_ends_at_1(tmp_path
     assert 0.8 < shares[-1] < 1
 
 
-def test_a_resumed_run_in_seconds_keeps_its_plan_and_its_clock(tmp_path: Path, progress) -> None:
+def test_a_resumed_run_in_seconds_keeps_its_clock(tmp_path: Path, progress) -> None:
     with pytest.raises(Killed):
         run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=killed_at(30)).train()
     journal = json.loads((tmp_path / "plan.json").read_text())
@@ -99,9 +99,7 @@ def test_what_a_kill_loses_is_spent(
     assert len(lost) == (29 - checkpoint.facts["seconds"] > 1.6)
 
 
-def test_a_run_that_is_killed_again_and_again_has_half_of_its_time(
-    tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_repeatedly_killed_run_has_half_its_time(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
     on_clock = (tmp_path, progress, monkeypatch, 60.0, lambda _: 0.2)
     for _ in range(9):
         with pytest.raises(Killed):
@@ -128,14 +126,14 @@ def test_what_was_spent_may_be_unreadable(
     assert run_on_a_made_up_clock(*on_clock).state.seconds == pytest.approx(60, abs=0.7)
 
 
-def test_checkpoints_come_often_in_short_runs_and_seldom_where_they_are_slow() -> None:
+def test_checkpoints_follow_the_runs_length() -> None:
     short, long, steps = TrainingBudget(None, 40.0), TrainingBudget(None, 900.0), TrainingBudget(400, None)
     assert checkpoint_interval(short, 0.0) == 2 and checkpoint_interval(short, 0.1) == pytest.approx(10)
     assert checkpoint_interval(short, 2.0) == checkpoint_interval(long, 0.0) == checkpoint_interval(steps, 0.0) == 30
 
 
 @pytest.mark.parametrize(("slow_step", "lasts"), [(0, 1.0), (0, 10.0), (1, 5.0), (100, 20.0), (600, 3.0)])
-def test_one_step_that_lasts_long_does_not_end_a_run_early(
+def test_one_long_step_does_not_end_a_run(
     slow_step: int, lasts: float, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = run_on_a_made_up_clock(
@@ -161,7 +159,7 @@ def test_a_machine_that_changes_its_speed_is_followed(
     assert run.state.step == pytest.approx(500 + 40 / (0.04 * factor), rel=0.05)
 
 
-def test_the_pace_forgets_the_first_step_and_takes_little_of_a_stall() -> None:
+def test_the_pace_forgets_first_steps_and_stalls() -> None:
     pace = Pace()
     pace.add(1.0, 4, 20.0)
     assert pace.seconds_per_step == 1.0

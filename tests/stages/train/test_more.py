@@ -54,7 +54,7 @@ def words(inputs: dict[str, Path], **more: Any) -> str | None:
     return larger_photos_words(config, inputs, scene, {})
 
 
-def test_photos_that_would_be_larger_by_a_fifth_are_named_with_the_way_to_them(inputs: dict[str, Path]) -> None:
+def test_photos_larger_by_a_fifth_are_named(inputs: dict[str, Path]) -> None:
     stay = "photos stay at 1/2 of their size and the field as large as it is"
     anew = "4 min from the start would have them at 1/1: --train.seconds 240, or a larger --budget, trains anew"
     assert words(inputs, more_seconds=180.0) == f"{stay}; {anew}"
@@ -66,7 +66,7 @@ def test_a_little_more_is_worth_no_word(inputs: dict[str, Path]) -> None:
     assert words(inputs, more_seconds=20.0) is None and words(inputs, more_steps=300) is None
 
 
-def test_it_is_said_once_and_not_of_a_size_that_was_asked_for(inputs: dict[str, Path], progress: Any) -> None:
+def test_photo_sizes_are_told_once_unless_asked_for(inputs: dict[str, Path], progress: Any) -> None:
     open_size = Config(after=NAME, more_seconds=180.0)
     whole = train.plan(open_size, inputs, progress)
     assert (whole.downscale, whole.more_seconds) == (2.0, 180.0)

@@ -74,7 +74,7 @@ def test_what_masks_ignore_is_not_drawn_and_takes_no_pixels(scene: Scene) -> Non
     assert chosen_downscale(large, 3_000_000, used) == 1.0 == chosen_downscale(large, 12_000_000)
 
 
-def test_many_photos_of_the_same_things_are_not_made_ever_smaller(scene: Scene) -> None:
+def test_redundant_photos_are_not_reduced_endlessly(scene: Scene) -> None:
     train = scene.of_split("train")[0]
     few, many = (
         replace(of_size(scene, 2000, 1000), views=tuple(replace(train, name=str(i)) for i in range(count)))
@@ -175,14 +175,14 @@ def test_a_gpu_has_larger_fields_and_takes_larger_steps(
 
 
 @pytest.mark.parametrize("folded", [True, False])
-def test_every_core_has_a_part_of_the_same_size_up_to_the_largest_step(folded: bool) -> None:
+def test_every_core_has_an_equal_part(folded: bool) -> None:
     parts = [with_defaults(with_grid(Config(contracted=folded), micro_batches=count)) for count in (1, 2, 64)]
     sizes = [part.grid.target_samples or 0 for part in parts]
     assert sizes == [MICRO_BATCH_SAMPLES[parts[0].space], 2 * sizes[0], MAX_STEP_SAMPLES]
     assert parts[2].learning_rate == LARGE_STEP_LEARNING_RATE >= (parts[1].learning_rate or 1)
 
 
-def test_samples_follow_cells_up_to_a_512th_and_from_a_1024th_to_a_2048th() -> None:
+def test_samples_follow_occupied_cells() -> None:
     folded = Config(contracted=True, view_dependence=True, grid=HashGridOptions(num_levels=1, log2_hashmap_size=8))
     sizes = (with_grid(folded, max_res=max_res) for max_res in (256, 512, 700, 1024, 2048, 4096))
     fields = [field_settings(config, sky=False) for config in sizes]
@@ -207,7 +207,7 @@ def test_ray_samples_multiply_the_samples_along_a_ray(contracted: bool, factor: 
 
 @pytest.mark.parametrize("has_alpha", [False, True])
 @pytest.mark.parametrize("contracted", [False, True])
-def test_a_sky_is_where_space_has_no_end_and_no_alpha_tells(scene: Scene, contracted: bool, has_alpha: bool) -> None:
+def test_unbounded_space_without_alpha_has_a_background(scene: Scene, contracted: bool, has_alpha: bool) -> None:
     config = GRID.model_copy(update={"contracted": contracted})
     assert has_background_model(config, replace(scene, has_alpha=has_alpha)) is (contracted and not has_alpha)
 
@@ -255,7 +255,7 @@ def test_grids_take_half_of_the_free_memory_at_most(
         ("cpu", 18e6, False, 1.0),
     ],
 )
-def test_the_pixels_take_half_of_a_gpus_free_memory_at_most(
+def test_pixels_take_half_of_a_gpus_memory(
     scene: Scene, device: str, free: float, has_alpha: bool, downscale: float, monkeypatch: pytest.MonkeyPatch, progress
 ) -> None:
     monkeypatch.setattr("stages.train.planning.compute_device", lambda: device)

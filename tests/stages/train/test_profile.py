@@ -61,9 +61,7 @@ def timed_step(of: HashGridTrainer | VanillaTrainer, step: int, timings: dict[st
 
 
 @pytest.mark.parametrize("kind", ["torch", "warp", "vanilla"])
-def test_a_run_has_the_same_bits_with_every_step_timed_and_with_none(
-    kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_timed_and_untimed_runs_have_equal_bits(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stages.train.profile.TIMED_EVERY", 1)
     monkeypatch.setattr("stages.train.profile.FIRST_TIMED", 0)
     timed, plain, timings = trainer(kind), trainer(kind), {}
@@ -143,7 +141,7 @@ def test_rows_are_eight_corners_of_each_grid_of_each_point() -> None:
     assert 0 < timings["samples"] <= timings["densities"]
 
 
-def test_the_floor_is_work_over_rate_and_waiting_is_the_rest() -> None:
+def test_the_floor_is_work_over_rate() -> None:
     timings: dict[str, Any] = COUNTED | {"steps": 2, "rays": 100, "core_seconds": 2.0}
     timings["parts"] = {"mlp": [1.0, 2e9, 0.0, 0.0], "gather": [0.5, 0.0, 1e7, 0.0], "rest": [0.25, 0.0, 0.0, 0.0]}
     table = parts_table(timings, RATES)
@@ -162,7 +160,7 @@ def test_threads_that_overlap_never_make_waiting_negative() -> None:
     assert table["most_rays_per_second"] is None
 
 
-def test_the_page_has_a_row_per_part_and_nothing_where_nothing_was_timed() -> None:
+def test_the_page_has_a_row_per_part() -> None:
     timings = COUNTED | {"parts": {"mlp": [0.5, 1e9, 0.0, 0.0]}}
     bar = parts_bar(parts_table(timings, RATES))
     assert bar is not None and parts_bar(None) is None
@@ -184,7 +182,7 @@ def test_the_file_is_written_where_a_step_was_timed(tmp_path: Path, monkeypatch:
     assert asked == [(CPU, 16, 1, RATES_SECONDS)]
 
 
-def test_rates_of_the_grid_field_are_at_the_size_of_its_table() -> None:
+def test_hash_grid_rates_are_at_its_table_size() -> None:
     grid = HashGridOptions(num_levels=2, log2_hashmap_size=8, max_res=64)
     config = Config(grid=grid, contracted=False, view_dependence=True)
     rows = field_of(config).table_rows(config)

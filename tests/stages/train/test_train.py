@@ -149,9 +149,7 @@ def test_a_grid_field_that_diverges_is_rolled_back(tmp_path: Path, progress, mon
     assert 13 < result.facts["heldout_psnr"] < 60
 
 
-def test_a_grid_field_that_stays_empty_is_given_up_by_name(
-    tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_empty_hash_grid_field_is_given_up(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs, _ = photographed(tmp_path, channels=4)
     monkeypatch.setattr("stages.train.loop.WARM_UP_STEPS", 3)
     monkeypatch.setattr("nerf.fields.mlp.sigma_of", lambda geometry: 0 * geometry[:, 0])
@@ -265,7 +263,7 @@ def test_plan_answers_everything_for_the_grid_field(
     assert train.plan(Config(grid=HashGridOptions(num_levels=3, max_res=64)), inputs, progress).grid.num_levels == 3
 
 
-def test_what_masks_ignore_does_not_count_for_the_size_of_the_photos(
+def test_masked_pixels_do_not_count_for_photo_size(
     tmp_path: Path, progress: Progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("stages.train.planning.MIN_LONG_SIDE", 2)

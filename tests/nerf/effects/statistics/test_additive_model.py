@@ -65,7 +65,7 @@ def test_the_slope_is_that_of_least_squares_with_its_error() -> None:
     assert 0.85 < np.std(off) < 1.25 and abs(np.mean(off)) < 0.3
 
 
-def test_a_slope_of_each_photos_own_is_no_slope_of_all() -> None:
+def test_slopes_of_single_photos_are_no_common_slope() -> None:
     """Light from one side: what a photo has in common is one draw, however many of its points show it."""
     draw = np.random.default_rng(8)
     layout, weight = two_way(draw.integers(0, 20, 2000), np.repeat(np.arange(400), 5), 20), np.ones(2000)

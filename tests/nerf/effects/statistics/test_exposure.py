@@ -49,14 +49,14 @@ def test_all_photos_brighter_changes_nothing() -> None:
     np.testing.assert_allclose(found[0], found[1], atol=1e-6)
 
 
-def test_the_order_of_observations_and_the_names_of_points_change_nothing() -> None:
+def test_order_and_names_of_observations_change_nothing() -> None:
     tracks = photographed_points(4, log_gain=drawn_gains(4, 12, 0.3))
     order = np.random.default_rng(0).permutation(len(tracks))
     renamed = replace(tracks.only(order), point=10_000 - 3 * tracks.point[order])
     np.testing.assert_allclose(fit_exposure(renamed).log_gain, fit_exposure(tracks).log_gain, atol=1e-9)
 
 
-def test_photos_in_which_something_stands_before_the_points_do_not_count() -> None:
+def test_occluded_photos_do_not_count() -> None:
     gain = np.zeros((12, 3))
     gain[:3] = 0.5 * EV
     fit, odd = fit_exposure(photographed_points(5, log_gain=gain)), np.arange(12) < 3
@@ -98,7 +98,7 @@ def test_a_photo_that_is_badly_measured_decides_nothing(deviation_ev: float, cal
         assert unsure.called_for is None and "do not count" not in unsure.words, "better than nothing"
 
 
-def test_what_cameras_wrote_is_laid_beside_the_gains_and_decides_nothing() -> None:
+def test_exif_exposures_decide_nothing() -> None:
     gain = np.linspace(-0.5, 0.5, 12) * EV
     fit = fit_exposure(photographed_points(3, log_gain=gain))
     alone = exposure_evidence(fit)

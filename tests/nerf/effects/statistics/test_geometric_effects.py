@@ -26,7 +26,7 @@ def test_the_ratio_of_footprints(ratio: float, called_for: bool | None) -> None:
         assert found.statistic == pytest.approx(ratio) and found.called_for is called_for
 
 
-def test_far_and_near_photos_are_compared_by_way_of_those_between() -> None:
+def test_far_and_near_photos_are_compared_through_others() -> None:
     """No point is seen by photos more than a third of the walk apart, the first of which are five times as far."""
     for seed in SEEDS:
         tracks = photographed_points(seed, views=30, per_point=4)
@@ -48,7 +48,7 @@ def test_a_few_false_points_are_no_scale() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.008, 0.05])
-def test_the_background_is_modelled_unless_alpha_says_that_there_is_none(share: float) -> None:
+def test_background_is_modelled_unless_alpha_rules_it_out(share: float) -> None:
     position = np.zeros((4000, 3))
     position[: int(share * 4000), 2] = -5
     found = background_evidence(position, np.repeat(np.arange(4000), 3), False, 0.1)

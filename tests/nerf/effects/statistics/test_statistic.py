@@ -9,7 +9,7 @@ from nerf.effects.statistics.statistic import HARM, decide, judged, unknown
 INFINITE = float("inf")
 
 
-def test_harm_is_what_costs_three_tenths_of_a_decibel_at_thirty() -> None:
+def test_the_minimum_effect_is_three_tenths_of_a_decibel() -> None:
     assert abs(-10 * log10(1e-3 + HARM**2) - 29.7) < 0.005
     assert abs(-10 * log10(1e-3 + (2 * HARM) ** 2) - 28.9) < 0.05
 

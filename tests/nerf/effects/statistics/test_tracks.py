@@ -17,7 +17,7 @@ def test_black_has_a_logarithm() -> None:
     assert np.isfinite(log_light(np.zeros(3))).all() and np.isfinite(log_noise(np.zeros(3))).all()
 
 
-def test_usable_observations_are_unsaturated_and_of_points_that_two_photos_show() -> None:
+def test_usable_observations_are_unsaturated_and_seen_twice() -> None:
     tracks = photographed_points(0, points=6, per_point=2)
     tracks.saturated[:] = False
     tracks.saturated[2] = True  # the point's other observation has no partner any more

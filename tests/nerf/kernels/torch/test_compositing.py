@@ -109,7 +109,7 @@ def test_extreme_densities_have_finite_values_and_gradients(densities: list[floa
     torch.testing.assert_close(rendering.colour[1:], by_itself.colour, rtol=0, atol=1e-6)
 
 
-def test_an_opaque_sample_hides_all_behind_it_and_has_no_gradient() -> None:
+def test_an_opaque_sample_hides_all_behind_it() -> None:
     samples = packed((4,))
     sigma = torch.tensor([0.0, 1e30, 1.0, 1.0], dtype=torch.float64)
     colour, (background, far) = field(samples)[1], surroundings(1)
@@ -140,7 +140,7 @@ def test_the_visible_samples_end_where_too_little_light_is_left() -> None:
     assert all(torch.equal(a, b) for a, b in zip(everything, samples, strict=True))
 
 
-def test_leaving_out_the_hidden_changes_a_rendering_by_less_than_the_threshold() -> None:
+def test_early_termination_changes_less_than_its_threshold() -> None:
     samples = packed((12,) * 20)
     sigma, colour = field(samples, 200.0)
     background, far = surroundings(20)
@@ -151,7 +151,7 @@ def test_leaving_out_the_hidden_changes_a_rendering_by_less_than_the_threshold()
     assert 0 < (full.colour - front.colour).abs().max() < 1e-3
 
 
-def test_thin_samples_are_kept_where_their_chances_add_up_to_whole_numbers() -> None:
+def test_thin_samples_survive_at_their_expected_number() -> None:
     samples, thin = packed((12, 0, 40)), 0.1
     sigma, _ = field(samples)
     kept, index = visible_samples(samples, sigma, 0.1, thin, torch.tensor([0.3, 0.0, 0.9]))

@@ -10,7 +10,7 @@ from nerf.kernels.torch import encode, encode_backward_points, encode_backward_t
 LAYOUT = grid_layout(num_levels=3, base_res=3, max_res=9, log2_hashmap_size=7, features_per_level=2)
 
 
-def test_levels_grow_from_the_coarsest_to_the_finest_and_one_alone_is_the_finest() -> None:
+def test_levels_grow_to_the_finest() -> None:
     assert grid_layout(
         num_levels=4, base_res=16, max_res=128, log2_hashmap_size=9, features_per_level=2
     ).resolutions == (16, 32, 64, 128)
@@ -68,7 +68,7 @@ def test_features_are_those_of_a_slow_loop() -> None:
     torch.testing.assert_close(encode(LAYOUT, table, points), slow, rtol=0, atol=1e-12)
 
 
-def test_a_vertex_gives_its_own_features_and_a_linear_table_a_linear_function() -> None:
+def test_a_linear_table_gives_a_linear_function() -> None:
     layout = grid_layout(1, 4, 4, 10, 3)
     axis = torch.arange(5, dtype=torch.float64) / 4
     vertices = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)

@@ -69,7 +69,7 @@ def test_intervals_of_a_full_cache_tile_each_ray(stepping: RayStepping) -> None:
     assert 0 < (lengths == 0).sum() < 50 or stepping.contracted
 
 
-def test_samples_of_an_empty_cell_are_skipped_and_the_others_stay_where_they_are() -> None:
+def test_samples_of_empty_cells_are_skipped_alone() -> None:
     rays = random_rays(400)
     jitter = jitter_of(rays)
     thickness = torch.rand(512, generator=torch.Generator().manual_seed(5))
@@ -93,7 +93,7 @@ def test_packing_counts_what_each_ray_has_in_order() -> None:
     assert (samples.t.diff()[samples.ray[1:] == samples.ray[:-1]] > 0).all()
 
 
-def test_a_ray_that_starts_inside_is_sampled_from_near_and_one_that_misses_is_not() -> None:
+def test_a_ray_inside_starts_at_near() -> None:
     origins = torch.tensor([[0.0, 0, 0], [0, 0, 5]])
     directions = torch.tensor([[1.0, 0, 0], [0, 1, 0]])
     rays = Rays(origins, directions, torch.full((2,), 0.2), torch.full((2,), 10.0))

@@ -48,7 +48,7 @@ def test_clearance_is_the_distance_to_the_nearest_occupied_brick() -> None:
     assert torch.equal(binary_occupancy(bits).empty_distance.long(), distance.clamp(max=MAX_EMPTY_DISTANCE))
 
 
-def test_nothing_is_clear_in_a_full_cache_and_all_of_it_in_an_empty_one() -> None:
+def test_empty_distance_is_zero_in_full_grids() -> None:
     assert binary_occupancy(torch.full((8,), -1)).empty_distance.tolist() == [0] * 8
     assert binary_occupancy(torch.zeros(8, dtype=torch.int64)).empty_distance.tolist() == [MAX_EMPTY_DISTANCE] * 8
     assert binary_occupancy(torch.zeros(1, dtype=torch.int64)).empty_distance.tolist() == [MAX_EMPTY_DISTANCE]

@@ -32,13 +32,13 @@ def test_light_that_is_stopped_at_the_point_costs_nothing() -> None:
     assert torch.equal(loss_of(torch.eye(4).double()[:3], [1.0, 2.0, 4.0]), torch.zeros(3).double())
 
 
-def test_it_is_the_mean_distance_from_where_light_is_stopped_to_the_point() -> None:
+def test_depth_loss_is_the_mean_distance_to_the_point() -> None:
     weights = torch.tensor([[0.5, 0.0, 0.25, 0.0], [0.0, 0.0, 0.0, 0.0]]).double()
     expected = torch.tensor([0.5 * 1 + 0.25 * 2 + 0.25 * 14, 16 - 2.0]).double()  # nothing stops the rest before far
     torch.testing.assert_close(loss_of(weights, [2.0, 2.0]), expected)
 
 
-def test_where_steps_grow_a_tenth_too_far_costs_the_same_at_any_distance() -> None:
+def test_relative_error_costs_the_same_at_any_distance() -> None:
     behind = torch.eye(4)[[2, 3]].double()  # all of the light is stopped at 4 and at 8
     near, far = loss_of(behind, [4 / 1.1, 8 / 1.1], GROWING)
     torch.testing.assert_close(near, far)

@@ -151,7 +151,7 @@ def test_thickness_from_nothing_to_1e30(first: list[float], second: list[float])
         assert not one.numel() or float((one - right).abs().max()) < TOLERANCE * scale
 
 
-def test_an_opaque_sample_has_exactly_no_gradient_and_hides_the_rest(device: str) -> None:
+def test_an_opaque_sample_has_no_gradient(device: str) -> None:
     samples = packed(device, [4])
     sigma = torch.tensor([0.0, 1e30, 1.0, 1.0], device=device)
     colour, background, far = seen(device, 1, 4)

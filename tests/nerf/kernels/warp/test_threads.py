@@ -46,9 +46,7 @@ def use_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]
     torch.set_num_threads(before)
 
 
-def test_kernels_are_compiled_on_all_cores_when_torch_has_given_them_up(
-    use_cores: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_kernels_compile_on_all_cores(use_cores: Callable[[int], None], monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
     monkeypatch.setattr(wp, "load_module", lambda *_, max_workers, **__: asked.append(max_workers))
     use_cores(3)
@@ -103,7 +101,7 @@ def run_briefly(trainer: HashGridTrainer, start: dict[str, Tensor]) -> dict[str,
 
 
 @pytest.mark.parametrize("field", [BOUNDED, OUTDOORS], ids=["bounded", "outdoors"])
-def test_a_training_run_has_the_same_bits_again_and_again_on_any_number_of_threads(
+def test_training_bits_are_the_same_on_any_threads(
     field: HashGridSettings, use_cores: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("nerf.fields.occupancy_grid.CHUNK_POINTS", 128)  # several chunks even here
@@ -229,7 +227,7 @@ print(json.dumps(list(results.values())))
 """
 
 
-def test_the_first_use_of_all_may_come_from_several_threads_at_once(tmp_path: Path) -> None:
+def test_first_use_may_come_from_several_threads(tmp_path: Path) -> None:
     """Nothing compiled, nothing loaded: the threads find the same kernels missing at the same time."""
     environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path)}
     answer = subprocess.run([sys.executable, "-c", COLD], cwd=ROOT, env=environment, capture_output=True, text=True)

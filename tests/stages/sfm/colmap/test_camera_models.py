@@ -43,7 +43,7 @@ def test_the_lens_is_the_simplest_that_describes_the_truth(camera: Camera, expec
     assert model.camera(1).mean_focal_length() == pytest.approx(native(camera).mean_focal_length(), rel=0.005)
 
 
-def test_a_fisheye_of_150_degrees_is_told_by_what_mapping_let_in() -> None:
+def test_a_150_degree_fisheye_is_told_by_mapping() -> None:
     camera = lens("OPENCV_FISHEYE", 344, 344, *CENTRE, 0.02, -0.01, 0, 0)
     choice = choose(mapped(photographed(camera, points=1200, room=True), widest=60), seed=0)
     assert choice.lenses[1].model.endswith("FISHEYE")
@@ -78,7 +78,7 @@ def test_with_too_few_points_nothing_is_compared() -> None:
     assert choice.notes[0].endswith("points are seen in three photos, too few to compare camera models")
 
 
-def test_a_single_photo_of_another_camera_is_no_lack_of_points() -> None:
+def test_a_single_photo_of_another_camera_has_enough_points() -> None:
     model = mapped(photographed(PINHOLE, BARREL, points=250))
     for image_id in sorted(i for i in model.reg_image_ids() if model.image(i).camera_id == 2)[1:]:
         model.deregister_frame(model.image(image_id).frame_id)
@@ -124,7 +124,7 @@ def test_where_every_candidate_is_degenerate_the_camera_stays(monkeypatch: pytes
     assert choice.notes[0].endswith("every candidate is degenerate, so it stays as mapping had it")
 
 
-def test_a_few_photos_with_degenerate_cameras_do_not_decide_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_degenerate_cameras_do_not_decide_for_others(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         camera_models,
         "why_degenerate",
@@ -143,7 +143,7 @@ def test_a_few_photos_with_degenerate_cameras_do_not_decide_for_the_others(monke
     )
 
 
-def test_one_observation_a_point_is_held_out_and_two_are_left() -> None:
+def test_one_observation_a_point_is_held_out() -> None:
     whole = photographed(PINHOLE, points=300)
     model = photographed(PINHOLE, points=300)
     out = hold_out(model, 0, 10_000)
@@ -214,7 +214,7 @@ def test_fisheye_counts_as_less_simple_than_any_other() -> None:
     assert [one.model.endswith("FISHEYE") for one in ordered] == 8 * [False] + 6 * [True]
 
 
-def test_noise_is_found_beneath_mismatches_and_in_residuals_that_points_follow() -> None:
+def test_noise_is_found_beneath_mismatches() -> None:
     model = mapped(photographed(PINHOLE, points=300, photos=6))
     seen = observations(model)
     assert noise_px(model, seen) == pytest.approx(0.5, rel=0.1)
@@ -222,7 +222,7 @@ def test_noise_is_found_beneath_mismatches_and_in_residuals_that_points_follow()
     assert noise_px(model, wild) == pytest.approx(0.55, rel=0.15)
 
 
-def test_where_the_chosen_lens_lets_many_more_observations_in_it_is_chosen_again(
+def test_a_lens_that_gains_observations_is_chosen_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     few, many = photographed(PINHOLE, photos=6, points=60), photographed(PINHOLE, photos=6, points=70)

@@ -128,7 +128,7 @@ def test_photos_of_the_same_points_look_alike(database: Path) -> None:
     assert alike[:-1, -1].max() < alike[:-1, :-1].min()
 
 
-def test_photos_without_a_place_are_joined_by_their_matches_with_those_that_have_one(database: Path) -> None:
+def test_unregistered_photos_are_joined_by_their_matches(database: Path) -> None:
     match_pairs(database, exhaustive(COUNT), 0, 0.8)
     names = [f"{i}.png" for i in range(COUNT)]
     assert links(database, set(names[:-2])).join
@@ -158,7 +158,7 @@ while True:
 """
 
 
-def test_a_database_that_is_held_open_can_be_opened_while_another_process_reads_along(database: Path) -> None:
+def test_an_open_database_can_be_read_along(database: Path) -> None:
     reader = subprocess.Popen(
         [sys.executable, "-c", READER, str(database)], stdout=subprocess.PIPE, cwd=Path(__file__).parents[4]
     )

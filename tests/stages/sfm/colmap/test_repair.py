@@ -77,7 +77,7 @@ def test_a_turned_photo_is_named_and_registered_again(made: Made, tmp_path: Path
     assert not (tmp_path / "again").exists()
 
 
-def test_a_photo_whose_matches_are_all_wrong_is_excluded_with_a_reason(made: Made) -> None:
+def test_a_wholly_mismatched_photo_is_excluded_with_a_reason(made: Made) -> None:
     """Ten in a hundred photos with injected matches: here photo 5 has keypoints of others' points."""
     random = np.random.default_rng(0)
     with pycolmap.Database.open(made.database) as db, pycolmap.DatabaseTransaction(db):
@@ -141,7 +141,7 @@ def verified_pairs(database: Path) -> set[tuple[int, int]]:
     return {pycolmap.pair_id_to_image_pair(pair_id) for pair_id in ids}
 
 
-def test_the_log_of_a_copy_whose_process_was_killed_is_not_taken_for_the_next_ones(made: Made, tmp_path: Path) -> None:
+def test_a_killed_copys_log_is_not_reused(made: Made, tmp_path: Path) -> None:
     copy, log = tmp_path / "thinned.db", tmp_path / "thinned.db-wal"
     thin_matches(made.database, copy)
     with closing(sqlite3.connect(copy)) as killed:

@@ -93,9 +93,7 @@ def test_mismatches_count_by_their_pull() -> None:
 
 
 @pytest.mark.parametrize("how", ["foreseen", "met"])
-def test_where_there_is_no_room_for_it_that_is_said_and_the_model_stands(
-    how: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lack_of_room_is_told_and_the_model_stands(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     model = photographed(CAMERA, photos=PHOTOS, points=POINTS)
     room = 6 * (6 * PHOTOS) ** 2 * 8
     monkeypatch.setattr(uncertainty, "available_bytes", lambda: room)

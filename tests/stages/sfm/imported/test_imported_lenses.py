@@ -47,7 +47,7 @@ def from_colmap(folder: Path, bent: list[int], count: int) -> ImportedPoses:
     return read_poses(folder, photos(count), {})
 
 
-def test_a_fold_in_the_very_corner_is_missed_by_coarse_looks() -> None:
+def test_a_fold_in_the_corner_is_missed_coarsely() -> None:
     assert camera_rays(Camera("OPENCV", W, H, (*LENS, BENT, 0.0, 0.0, 0.0)), 32, 32).shape == (32, 32, 3)
 
 

@@ -47,7 +47,7 @@ def lens(model: str, width: int = WIDTH, height: int = HEIGHT) -> Camera:
 
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
 @pytest.mark.parametrize("model", sorted(PARAMETERS.keys() - {"EQUIRECTANGULAR"}))
-def test_a_turned_camera_sees_a_point_where_the_turned_picture_shows_it(model: str, orientation: int) -> None:
+def test_a_turned_camera_sees_points_as_its_picture(model: str, orientation: int) -> None:
     camera, turns = lens(model), QUARTER_TURNS[orientation]
     rng = np.random.default_rng(7)
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -192,7 +192,7 @@ def test_no_camera_is_mirrored(orientation: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
-def test_a_camera_that_only_fits_the_upright_photo_is_of_that(orientation: int, tmp_path: Path) -> None:
+def test_a_camera_of_the_upright_photo_fits_it(orientation: int, tmp_path: Path) -> None:
     known = read_one(tmp_path, turned_photo(orientation), w=2 * HEIGHT, h=2 * WIDTH, fl_x=100, fl_y=104)
     (camera,) = known.model.cameras
     assert camera.params == pytest.approx((50, 52, 15.5, 9, 0.05, -0.02, 0.01, -0.02))
@@ -200,7 +200,7 @@ def test_a_camera_that_only_fits_the_upright_photo_is_of_that(orientation: int, 
     assert known.notes == []
 
 
-def test_a_camera_that_fits_neither_is_refused_with_the_size_it_came_with(tmp_path: Path) -> None:
+def test_a_camera_that_fits_neither_orientation_is_refused(tmp_path: Path) -> None:
     with refused("sfm.photo-shape", "80×40", "40×60"):
         read_one(tmp_path, turned_photo(6), w=80, h=40)
 

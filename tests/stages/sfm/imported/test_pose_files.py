@@ -286,7 +286,7 @@ OF_THEIR_FRAMES = {
 
 
 @pytest.mark.parametrize("program", OF_OTHERS)
-def test_poses_are_those_of_the_file_whatever_else_is_in_it(read, program: str) -> None:
+def test_poses_are_the_files_whatever_else_it_holds(read, program: str) -> None:
     known = read([frame(i, **OF_THEIR_FRAMES[program]) for i in range(3)], **LENS, **OF_OTHERS[program])
     plain = read([frame(i) for i in range(3)], **LENS)
     assert known.model.cameras == plain.model.cameras and known.notes == plain.notes == []
@@ -418,7 +418,7 @@ def test_points_behind_cameras_or_in_them_are_left_out(tmp_path: Path) -> None:
     assert len(seen.xyz) == len(set(seen.point.tolist())) == len(seen.rgb) == len(seen.error_px)
 
 
-def test_a_colmap_model_is_matched_by_name_and_keeps_its_points(tmp_path: Path) -> None:
+def test_a_colmap_model_is_matched_by_name(tmp_path: Path) -> None:
     given = colmap_model(tmp_path, ["ä1.png", "elsewhere/ä0.png", "other.png"])
     known = read_poses(tmp_path, PHOTOS, {})
     assert [image.file for image in known.model.images] == ["a0.png", "a1.png"]

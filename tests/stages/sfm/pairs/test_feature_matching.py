@@ -67,7 +67,7 @@ def test_what_repeats_is_not_matched() -> None:
     assert len(match_descriptors(np.concatenate([first, first]), second, 0.8)) == 0
 
 
-def test_far_ones_are_not_matched_even_where_nothing_else_is_there() -> None:
+def test_far_descriptors_are_not_matched() -> None:
     here, far = np.zeros((1, 128), np.uint8), np.zeros((1, 128), np.uint8)
     for square, expected in ((358, 1), (359, 0)):  # FARTHEST is 358.4
         far[0, :2] = 255, round((square**2 - 255**2) ** 0.5)
@@ -98,7 +98,7 @@ def words_of(descriptors: np.ndarray) -> np.ndarray:
     return np.rint(visual_words(descriptors.astype(np.float32), np.random.default_rng(0), CELLS))
 
 
-def test_with_no_more_cells_than_are_probed_indexed_matches_are_exact() -> None:
+def test_probing_all_cells_matches_exactly() -> None:
     first, second = views(300, noise=18.0)
     words = words_of(first)[:PROBES]
     assert indexed(first, second, words) == match_descriptors(first, second, 0.8).tolist()

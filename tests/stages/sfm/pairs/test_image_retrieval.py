@@ -22,7 +22,7 @@ def similarity(descriptors: Callable[[int], np.ndarray], count: int, seed: int =
     return photo_similarity(descriptors, count, vocabulary(descriptors, count, seed))
 
 
-def test_photos_that_share_features_look_alike_in_the_order_of_how_much_they_share() -> None:
+def test_photos_with_shared_features_are_similar_in_order() -> None:
     photos = walk(30)
     alike = similarity(photos.__getitem__, 30)
     ranked = np.argsort(-np.where(np.eye(30, dtype=bool), -np.inf, alike), axis=1)

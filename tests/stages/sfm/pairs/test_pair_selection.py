@@ -74,7 +74,7 @@ def test_retrieval_begins_with_the_most_similar_and_all_hang_together(count: int
         assert found >= set(best)
 
 
-def test_two_groups_that_look_like_themselves_only_are_joined_by_their_likest_pair() -> None:
+def test_separate_groups_are_joined_by_their_likest_pair() -> None:
     alike = np.full((6, 6), -0.5)
     alike[:3, :3] = alike[3:, 3:] = 0.9
     alike[1, 5] = alike[5, 1] = 0.1
@@ -170,7 +170,7 @@ def test_where_positions_tell_nothing_looks_choose_half_of_the_partners(error_m:
     assert sum(map(len, found)) <= 2 * 120 * 30
 
 
-def test_a_second_look_takes_as_many_pairs_again_for_the_missing() -> None:
+def test_a_second_selection_doubles_the_pairs_of_missing() -> None:
     alike = similarity(40)
     pairs = nearest(alike, 4)
     again = second_look(pairs, [3, 17], 4, lambda: alike)

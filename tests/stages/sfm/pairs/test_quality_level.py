@@ -106,7 +106,7 @@ def test_what_was_asked_for_stands(progress) -> None:
         assert sfm.plan(config, {}, progress) == config
 
 
-def test_measured_are_neighbours_from_all_over_the_set_enough_for_all_cores() -> None:
+def test_timed_pairs_are_neighbours_from_everywhere() -> None:
     def numbers(count: int, cores: int) -> list[int]:
         return [int(photo.name.removesuffix(".jpg")) for photo in _sample(photos(count), cores)]
 
@@ -133,7 +133,7 @@ def test_places_are_needed_to_go_by_places() -> None:
     assert "--sfm.matcher retrieval" in caught.value.hint
 
 
-def test_where_time_is_given_sets_of_ordinary_size_give_way_too(progress, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_time_given_ordinary_sets_reduce_too(progress, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = costing(monkeypatch, (0.5, 0.05), (0.2, 0.01))
     assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, 60.0) == Chosen(1131, 2048, "exhaustive")
     assert asked == list(QUALITY_LEVELS[:2]) and "50 photos searched at 1600 pixels" in progress.notes[0]
