@@ -240,7 +240,7 @@ def test_every_field_has_its_options_under_its_name() -> None:
 
 
 @pytest.mark.parametrize("given", [{}, {"grid": {"num_levels": 4}}, {"preset": "paper"}, {"vanilla": {"width": 9}}])
-def test_what_is_written_down_has_the_options_of_its_field_alone(given: dict) -> None:
+def test_recorded_options_are_of_one_field_alone(given: dict) -> None:
     config = Config(**given)
     assert {*config.model_dump(mode="json")} & {*FIELD_NAMES} == {config.kind}
     assert {*config.model_dump(include={*FIELD_NAMES})} == {config.kind}
