@@ -25,7 +25,7 @@ OUTDOORS = HashGridField(replace(GRID, background_model=True), 5, KERNELS)
 OUTDOORS.background_table.normal_(generator=torch.Generator().manual_seed(6))
 KINDS = {"vanilla": VanillaNerf(SMALL, seed=5), "grid": HashGridField(GRID, 5, KERNELS), "sky": OUTDOORS}
 BY_TORCH = "the hash-grid field is computed by torch alone, as it was trained"
-INFO = {"background": [1.0, 1.0, 1.0], "downscale": 2.5, "steps": 7, "rays": 700}
+INFO = {"background": [1.0, 1.0, 1.0], "downscale": 2.5, "steps": 7, "rays": 700, "effects": {}}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -94,16 +94,16 @@ def test_a_model_without_a_format_is_refused(tmp_path: Path) -> None:
 
 
 RAYS = Rays(torch.zeros(3, 3), torch.eye(3), torch.full((3,), 0.5), torch.full((3,), 4.0))
-EXPOSURE = {"neutral": [0.1, 0.0, -0.1], "photos": {"a.jpg": [0.5, 0.4, 0.3], "b 2.jpg": [-0.5, -0.4, -0.3]}}
+EXPOSURE = {"a.jpg": [0.5, 0.0, 0.3], "b 2.jpg": [0.1, 0.0, -0.1], "c.jpg": [-0.5, 0.0, -0.3]}
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_field_with_exposure_is_shown_at_the_neutral_one(kind: str, tmp_path: Path) -> None:
+def test_a_field_with_exposure_is_shown_at_the_reference(kind: str, tmp_path: Path) -> None:
     plain = KINDS[kind]
-    save_field(tmp_path, plain, INFO | {"exposure": EXPOSURE})
+    save_field(tmp_path, plain, INFO | {"effects": {"exposure": EXPOSURE}})
     loaded, info = load_field(tmp_path)
-    assert info["exposure"] == EXPOSURE and isinstance(loaded, AppearanceModel)
-    exposure = ExposureModel(torch.tensor([EXPOSURE["neutral"]]))
+    assert info["effects"] == {"exposure": EXPOSURE} and isinstance(loaded, AppearanceModel)
+    exposure = ExposureModel(torch.tensor([EXPOSURE["b 2.jpg"]]))
     wanted = AppearanceModel(plain, (exposure,)).render(RAYS, torch.ones(3)).colour
     assert torch.equal(loaded.render(RAYS, torch.ones(3)).colour, wanted)
     assert (wanted[:, 1] == plain.render(RAYS, torch.ones(3)).colour[:, 1]).all()
@@ -119,15 +119,18 @@ def test_a_field_without_exposure_is_the_field_itself(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "harm",
     [
-        {"neutral": [0.0, 0.0]},
-        {"photos": {"a.jpg": [0.0, "bright", 0.0]}},
-        {"photos": None},
-        {"neutral": 1.0},
-        {"neutral": [10**400, 0, 0]},
+        {"exposure": {"a.jpg": [0.0, 0.0]}},
+        {"exposure": {"a.jpg": [0.0, "bright", 0.0]}},
+        {"exposure": None},
+        {"exposure": {"a.jpg": 1.0}},
+        {"exposure": {"a.jpg": [10**400, 0, 0]}},
+        {"exposure": {"a.jpg": [1e39, 0, 0]}},
+        {"exposure": {}},
+        None,
     ],
 )
-def test_damaged_exposure_is_refused_in_words(harm: dict[str, object], tmp_path: Path) -> None:
-    save_field(tmp_path, KINDS["vanilla"], INFO | {"exposure": EXPOSURE | harm})
+def test_damaged_effects_are_refused_in_words(harm: object, tmp_path: Path) -> None:
+    save_field(tmp_path, KINDS["vanilla"], INFO | {"effects": harm})
     with refused("io.field-weights"):
         load_field(tmp_path)
 
