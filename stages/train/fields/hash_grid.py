@@ -14,7 +14,7 @@ from stages.hardware.backend import chosen_backend, load_backend
 from stages.hardware.device import compute_device, cores
 from stages.hardware.memory import available_on
 from stages.train.config import Config
-from stages.train.data import has_background_model, training_background
+from stages.train.data import has_background_model, space_of, training_background
 from stages.train.fields.hash_grid_options import MAX_MICRO_BATCHES
 
 if TYPE_CHECKING:
@@ -209,7 +209,7 @@ def field_settings(config: Config, sky: bool) -> HashGridSettings:
         log2_hashmap_size=grid.log2_hashmap_size,
         base_res=min(BASE_RES[config.space], grid.max_res),
         max_res=grid.max_res,
-        contracted=config.contracted,
+        space=space_of(config),
         diagonal_steps=max(1, round(grid.ray_samples * min(math.sqrt(3) * grid.max_res, MAX_STEPS))),
         min_step_size=shortest,
         cone_angle=shortest / EVEN_UNTIL,

@@ -8,7 +8,7 @@ from nerf.training.vanilla_trainer import CHUNK_RAYS, VanillaTrainer, VanillaTra
 from stages.contract import Progress
 from stages.hardware.device import cores
 from stages.train.config import Config
-from stages.train.data import training_background
+from stages.train.data import space_of, training_background
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
@@ -121,4 +121,4 @@ def field_settings(config: Config) -> VanillaSettings:
     """Sizes and ablations of the field."""
     assert config.contracted is not None and config.view_dependence is not None, "plan() takes them from stage effects"
     sizes = config.vanilla.model_dump(exclude={"batch_rays"})
-    return VanillaSettings(contracted=config.contracted, view_dependence=config.view_dependence, **sizes)
+    return VanillaSettings(space=space_of(config), view_dependence=config.view_dependence, **sizes)
