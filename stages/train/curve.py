@@ -1,6 +1,6 @@
 """curve.json: quality against training time, and what it says in words.
 
-``{"field": "grid" | "paper", "downscale", "device": "cpu" | "cuda", "threads", "single_cycle", "points": [{"step",
+``{"field", "downscale", "device": "cpu" | "cuda", "threads", "single_cycle", "points": [{"step",
 "seconds", "train_psnr", "probe_psnr", "probe_ssim"} …]}``; what cannot be measured is null. ``downscale`` is that of
 the photos trained on. ``probe_psnr`` is of a fixed sample of pixels of all test photos, taken together, at the size at
 which photos are scored: it follows the score, PSNR of stage evaluate, and is not it. Seconds are those of training
@@ -23,12 +23,15 @@ from nerf.training.learning_curve import (
 from stages.amounts import duration, duration_option
 from stages.hardware.device import compute_device, cores
 from stages.io.files import write_json
+from stages.train.config import OPTIONS_OF_FIELD, FieldName
 
 BARS = "▁▂▃▄▅▆▇█"
 SPARK_WIDTH = 10
 
 
-def write_curve(folder: Path, field: str, downscale: float, single_cycle: bool, points: list[dict[str, Any]]) -> None:
+def write_curve(
+    folder: Path, field: FieldName, downscale: float, single_cycle: bool, points: list[dict[str, Any]]
+) -> None:
     """Write curve.json of a run that ends on this machine."""
     about = {"field": field, "downscale": downscale, "device": compute_device(), "threads": cores()}
     about["single_cycle"] = single_cycle
@@ -41,16 +44,12 @@ def probe_curve(points: Sequence[dict[str, Any]]) -> list[tuple[float, float]]:
     return [(seconds, psnr) for seconds, psnr in known if psnr is not None and seconds > 0]
 
 
-def predicted_gain(field: str, single_cycle: bool, points: Sequence[dict[str, Any]]) -> PredictedGain | None:
+def predicted_gain(field: FieldName, single_cycle: bool, points: Sequence[dict[str, Any]]) -> PredictedGain | None:
     """The predicted gain of twice the training time at the same sizes of photos and field, as ``--more`` keeps them.
-    None if the curve is too short, and for runs that the prediction was not fitted to: those of the vanilla NeRF,
-    whose learning rate decays all the way, and those not of a ``single_cycle``, which may have decayed at half of
-    the time."""
-    return (
-        predicted_doubling_gain(probe_curve(points), points[-1]["step"])
-        if points and field == "grid" and single_cycle
-        else None
-    )
+    None if the curve is too short, and for runs that the prediction was not fitted to: those of another field than the
+    hash grid, and those not of a ``single_cycle``, which may have decayed at half of the time."""
+    fitted = single_cycle and OPTIONS_OF_FIELD[field].predicts_gains
+    return predicted_doubling_gain(probe_curve(points), points[-1]["step"]) if points and fitted else None
 
 
 def doubling_message(points: Sequence[dict[str, Any]], gain: PredictedGain | None) -> str | None:

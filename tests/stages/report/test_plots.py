@@ -73,8 +73,9 @@ def test_the_curve_shows_prediction_and_knee():
     flat = [row | {"probe_psnr": 20 - 8 / row["seconds"]} for row in _curve()]
     assert "diminishing returns, 16 s" in (curve_svg(flat, {}) or "")
     unknown = [row | {"probe_psnr": None} for row in _curve()]
-    for about in (("grid", True, unknown), ("paper", True, _curve()), ("grid", False, _curve())):
-        assert predicted_gain(*about) is None
+    assert predicted_gain("grid", True, unknown) is None
+    assert predicted_gain("vanilla", True, _curve()) is None
+    assert predicted_gain("grid", False, _curve()) is None
     assert "predicted" not in (curve_svg(unknown, {}) or "predicted")
 
 

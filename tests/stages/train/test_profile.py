@@ -21,8 +21,10 @@ from stages.hardware.backend import load_backend
 from stages.io.files import read_json
 from stages.report.profile import SPANS, profile_bar
 from stages.train import Config
-from stages.train.fields import field_of
+from stages.train.fields.field_list import field_of
 from stages.train.fields.hash_grid import field_settings
+from stages.train.fields.hash_grid_options import HashGridOptions
+from stages.train.fields.vanilla_options import VanillaOptions
 from stages.train.profile import (
     FIRST_PROFILED_STEP,
     PROFILE_INTERVAL,
@@ -37,7 +39,7 @@ CPU = torch.device("cpu")
 RATES = Rates(1e10, 1e8, 1e10)
 GRID_SPANS = {"batch", "march", "gather", "encode", "mlp", "composite", "backward", "scatter", "optimiser", "occupancy"}
 VANILLA_SPANS = {"batch", "sampling", "encode", "mlp", "composite", "backward", "optimiser"}
-PAPER: dict[str, Any] = {"depth": 3, "width": 16, "skip": 1, "samples_coarse": 8, "samples_fine": 8}
+VANILLA: dict[str, Any] = {"depth": 3, "width": 16, "skip": 1, "samples_coarse": 8, "samples_fine": 8}
 COUNTED: dict[str, Any] = {
     "steps": 1,
     "rays": 8,
@@ -57,9 +59,9 @@ def dataset() -> RayDataset:
 
 
 def trainer(kind: str) -> HashGridTrainer | VanillaTrainer:
-    if kind == "paper":
+    if kind == "vanilla":
         return VanillaTrainer(
-            VanillaNerf(VanillaSettings(**PAPER), 0), dataset(), VanillaTrainerSettings(32, 0, "random")
+            VanillaNerf(VanillaSettings(**VANILLA), 0), dataset(), VanillaTrainerSettings(32, 0, "random")
         )
     backend = load_backend("warp" if kind == "warp" else "torch", "cpu")
     settings = HashGridTrainerSettings(0, "random", target_samples=512, micro_batches=2, distortion_weight=1e-3)
@@ -72,7 +74,7 @@ def profiled(of: HashGridTrainer | VanillaTrainer, step: int, timings: dict[str,
     return profiled_step(partial(of.step, step, 0.1, 1.0), step, timings, CPU)
 
 
-@pytest.mark.parametrize("kind", ["torch", "warp", "paper"])
+@pytest.mark.parametrize("kind", ["torch", "warp", "vanilla"])
 def test_timed_and_untimed_runs_have_equal_bits(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stages.train.profile.PROFILE_INTERVAL", 1)
     monkeypatch.setattr("stages.train.profile.FIRST_PROFILED_STEP", 0)
@@ -84,7 +86,7 @@ def test_timed_and_untimed_runs_have_equal_bits(kind: str, monkeypatch: pytest.M
         assert torch.equal(tensor, timed.state()[name]), name
 
 
-@pytest.mark.parametrize("kind", ["torch", "warp", "paper"])
+@pytest.mark.parametrize("kind", ["torch", "warp", "vanilla"])
 def test_shares_sum_to_one_and_every_part_is_there(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stages.train.profile.PROFILE_INTERVAL", 1)
     monkeypatch.setattr("stages.train.profile.FIRST_PROFILED_STEP", 0)
@@ -100,7 +102,7 @@ def test_shares_sum_to_one_and_every_part_is_there(kind: str, monkeypatch: pytes
     assert sum(row["share"] for row in table["spans"]) == pytest.approx(1, abs=1e-3)
     assert sum(row["seconds"] for row in table["spans"]) == pytest.approx(table["core_seconds"], abs=2e-3)
     names = {row["span"] for row in table["spans"]}
-    assert names == (VANILLA_SPANS if kind == "paper" else GRID_SPANS) | {"rest", "idle"}
+    assert names == (VANILLA_SPANS if kind == "vanilla" else GRID_SPANS) | {"rest", "idle"}
     assert all(row["seconds"] >= 0 for row in table["spans"])
     seconds = [row["seconds"] for row in table["spans"]]
     assert seconds == sorted(seconds, reverse=True)
@@ -108,21 +110,21 @@ def test_shares_sum_to_one_and_every_part_is_there(kind: str, monkeypatch: pytes
 
 
 def test_few_steps_are_timed() -> None:
-    of, timings = trainer("paper"), {}
+    of, timings = trainer("vanilla"), {}
     for step in range(PROFILE_INTERVAL + FIRST_PROFILED_STEP + 1):
         profiled(of, step, timings)
     assert timings["steps"] == 2
 
 
-@pytest.mark.parametrize("kind", ["torch", "paper"])
+@pytest.mark.parametrize("kind", ["torch", "vanilla"])
 @pytest.mark.parametrize("changed", [{}, {"hierarchical": False}, {"skip": 4}, {"view_dependence": False}])
 def test_products_are_those_that_torch_counts(
     kind: str, changed: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if kind == "torch" and changed:
-        pytest.skip("settings of the paper field")
+        pytest.skip("settings of the vanilla field")
     for name, value in changed.items():
-        monkeypatch.setitem(PAPER, name, value)
+        monkeypatch.setitem(VANILLA, name, value)
     of, timings = trainer(kind), {}
     monkeypatch.setattr("nerf.runtime.parallel.workers", lambda: 1)  # the counter sees the thread that it is opened in
     with FlopCounterMode(display=False) as counted:
@@ -188,7 +190,7 @@ def test_the_page_has_a_row_per_part() -> None:
 def test_the_file_is_written_where_a_step_was_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     monkeypatch.setattr("stages.train.profile.measure_rates", lambda *sizes: asked.append(sizes) or RATES)
-    of, timings, config = trainer("paper"), {}, Config(field="paper", width=16)
+    of, timings, config = trainer("vanilla"), {}, Config(vanilla=VanillaOptions(width=16))
     assert write_profile(tmp_path, timings, config, CPU) == []
     profiled(of, FIRST_PROFILED_STEP, timings)
     assert write_profile(tmp_path, timings, config, CPU) == ["profile.json"]
@@ -197,6 +199,7 @@ def test_the_file_is_written_where_a_step_was_timed(tmp_path: Path, monkeypatch:
 
 
 def test_hash_grid_rates_are_at_its_table_size() -> None:
-    config = Config(levels=2, log2_rows=8, finest=64, contracted=False, view_dependence=True)
+    grid = HashGridOptions(num_levels=2, log2_hashmap_size=8, max_res=64)
+    config = Config(grid=grid, contracted=False, view_dependence=True)
     rows = field_of(config).table_rows(config)
     assert (field_of(config).matmul_width(config), rows) == (64, field_settings(config, sky=False).layout.rows)
