@@ -1,6 +1,6 @@
 """Exposure brackets: the middle exposure of each place, against all of them with exposure modelled.
 
-    python -m benchmarks.brackets ../shared/data/fountain_p11 --folder F --steps 1500 --out benchmarks/results/brackets.json
+    python -m benchmarks.brackets ../shared/data/fountain_p11 --folder F --out benchmarks/results/brackets.json
 
 Every photo becomes three (0, -2, +2 EV in linear light, clipped, 8 bits). Of every third place, three times another
 third, the middle exposure is a test photo and the others are unused; cameras are the measured ones. Both trainings take
