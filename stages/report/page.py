@@ -32,6 +32,7 @@ from stages.report.cameras import (
 )
 from stages.report.effects import effects_table
 from stages.report.plots import ORDER_COLOURS, Score, camera_svgs, curve_svg
+from stages.report.profile import profile_bar
 from stages.tradeoff.plots import COLUMNS, plot_svg, rendering_sentence, table_cells
 from stages.train.curve import diminishing_returns_message, doubling_message, more_option, predicted_gain, ssim_message
 
