@@ -210,9 +210,9 @@ def _line(found: Normalisation) -> str:
     """What was decided, for the user."""
     arc = 360 if found.arc_deg > FULL_TURN_DEG else round(found.arc_deg / 10) * 10
     capture_type = {
-        "around": f"{arc}° around an object",
-        "inside": "inside a space, looking around",
-        "forward": "photos facing one way",
+        "object-centric": f"{arc}° around an object",
+        "inside-out": "inside-out capture of a space",
+        "forward-facing": "forward-facing capture",
     }[found.capture_type]
     background = "transparent" if found.bounded else "unbounded"
     up = f"up from {found.up.source}" if found.up.known else "no up: the cameras disagree"
