@@ -192,7 +192,7 @@ def all_plain(colours: Sequence[tuple[str, str]]) -> StageError:
     """The error for photos that show nothing: (name, the one colour of all its pixels)."""
     name, colour = colours[0]
     why = f"{shown(name)} is {colour} everywhere, so there is nothing that could be found or learnt"
-    hint = "Look at the photos: a cap on the lens, an exposure far off, or an export that failed."
+    hint = "Look at the photos: a cap on the lens, a wrong exposure, or a failed export."
     return StageError("ingest.plain-photos", f"all {len(colours)} photos show one single colour", why, hint)
 
 

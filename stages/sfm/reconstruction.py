@@ -149,9 +149,7 @@ def _check_camera(config: "Config", photos: Sequence[Photo]) -> None:
     what = "cannot use --sfm.camera-params"
     hint = "Give COLMAP's numbers for these photos: --sfm.camera-model SIMPLE_RADIAL --sfm.camera-params F CX CY K."
     if config.camera_model is None:
-        raise StageError(
-            "sfm.parameters-without-model", what, "the model that they are the parameters of is not given", hint
-        )
+        raise StageError("sfm.parameters-without-model", what, "they need --sfm.camera-model", hint)
     sizes = sorted({(photo.width, photo.height) for photo in photos})
     if len(sizes) > 1:
         listed = ", ".join(f"{width}×{height}" for width, height in sizes[:3])
@@ -234,7 +232,7 @@ def _georeference(folder: Path, photos: Sequence[Photo], progress: Progress) -> 
     centres = np.array([image.sfm_from_camera[:, 3] for image in located])
     found = georeference(centres, [position_of[image.file] for image in located])
     if isinstance(found, str):
-        progress.note(f"no metres from the photos' GPS: {found}")
+        progress.note(f"the photos' GPS gives no metric scale: {found}")
         return None
     scale = f"one unit is {found.enu_from_sfm.scale:.3g} m"
     progress.note(f"GPS of {found.used} photos: {scale}; positions are off by {found.error_m:.1f} m (median)")

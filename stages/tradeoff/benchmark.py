@@ -118,9 +118,9 @@ def _check_masks(crops: tuple[Crop, ...]) -> None:
     """Raise StageError unless some of the pixels that every run is scored on count."""
     scored = slice(None, None, SCORING_STRIDE)
     if not any(crop.mask is None or crop.mask[scored, scored].any() for crop in crops):
-        why = "masks leave next to nothing of the held-out photos at this size"
+        why = "masks leave almost nothing of the test photos at this size"
         hint = "Lower --normalise.test-every, or ignore less."
-        raise StageError("tradeoff.no-pixels-to-score", "nothing to score a study by", why, hint)
+        raise StageError("tradeoff.no-pixels-to-score", "nothing to score the study on", why, hint)
 
 
 # --- one run
@@ -144,7 +144,7 @@ def train_and_score(run: Run, benchmark: Benchmark, inputs: Inputs, folder: Path
         except StageError as error:
             if error.code not in RUN_FAILURES:
                 what = f"the study stopped at {run.label}: {error.what}"
-                hint = "Close other programs or free disk space; the same command then goes on with this training."
+                hint = "Close other programs or free disk space; the same command then continues with this training."
                 raise StageError("tradeoff.stopped", what, error.why, hint) from error
             figures["failed"] = f"{error.what}: {error.why}"
         else:

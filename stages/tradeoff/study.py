@@ -99,9 +99,9 @@ def plan_study(config: "Config", inputs: Inputs, progress: Progress) -> "Config"
 def _scene_with_test_photos(inputs: Inputs) -> Scene:
     scene = read_scene(inputs["normalise"])
     if not scene.of_split("test"):
-        why = "no photo of this scene was kept for testing"
+        why = "this scene has no test photos"
         hint = "Lower --normalise.test-every, or add photos."
-        raise StageError("tradeoff.no-test-photos", "nothing to score a study by", why, hint)
+        raise StageError("tradeoff.no-test-photos", "nothing to score the study on", why, hint)
     return scene
 
 
@@ -176,7 +176,7 @@ def run_study(config: "Config", inputs: Inputs, folder: Path, progress: Progress
     if len(failed) == len(results):
         why = "; ".join(dict.fromkeys(str(figures["failed"]) for _, figures in results))
         why = why or f"{duration(config.seconds)} are too short here even for {schedule.left_out[0]}"
-        raise StageError("tradeoff.no-result", "the study has no result", why, "Give it more time, as in --budget 30m.")
+        raise StageError("tradeoff.no-result", "the study has no result", why, "Give it more time, e.g. --budget 30m.")
     return Outcome(results, (*schedule.left_out, *list_runs(late), *failed), existing, benchmark)
 
 

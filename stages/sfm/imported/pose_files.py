@@ -501,7 +501,7 @@ def _nothing_matches(source: str, names: Sequence[str], photos: Sequence[Photo])
         "sfm.no-camera-matches",
         f"no camera in {source} belongs to a photo",
         f"it is of {_few(names, MAX_NAMES_OF_ERROR)}, and the photos are {here}",
-        "Give the folder of the very photos that the cameras were made for.",
+        "Give the folder of the photos that these cameras belong to.",
     )
 
 

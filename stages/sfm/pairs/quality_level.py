@@ -97,7 +97,7 @@ def check_matcher(matcher: Matcher | None, priors: CapturePriors) -> None:
         raise StageError(
             "sfm.no-positions",
             "cannot select pairs of photos by GPS position",
-            "not all photos tell by EXIF where they were taken",
+            "not all photos have a GPS position in their EXIF data",
             "Leave out --sfm.matcher, or try --sfm.matcher retrieval.",
         )
 
@@ -172,7 +172,7 @@ def _measured(photos: Sequence[Photo], images: Path, level: QualityLevel, matche
         why = lines[-1] if lines else f"COLMAP ended with {answer.returncode}"
         every = f"--sfm.matcher exhaustive --sfm.max-image-size {level.max_image_size}"
         hint = f"Say how, and nothing is measured: {every} --sfm.max-features {level.max_features}."
-        raise StageError("sfm.not-measured", "could not measure what features and matches take", why, hint)
+        raise StageError("sfm.not-measured", "could not measure how long features and matches take", why, hint)
     return Cost(**json.loads(answer.stdout))
 
 

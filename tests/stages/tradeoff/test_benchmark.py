@@ -87,4 +87,4 @@ def test_where_masks_leave_too_little_the_best_places_are_taken(
 def test_masks_that_leave_nothing_are_said(tmp_path: Path) -> None:
     with refused("tradeoff.no-pixels-to-score") as caught:
         masked_benchmark(tmp_path, (slice(0, 0), slice(0, 0)))
-    assert "masks leave next to nothing" in caught.value.why
+    assert "masks leave almost nothing" in caught.value.why
