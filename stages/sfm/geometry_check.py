@@ -31,10 +31,10 @@ MIN_RELATIVE_DEPTH = 1e-3  # of its distance to the other photo: nearer a point 
 MAX_RECHECKS = 12  # of misplaced photos; being cleared goes on from neighbour to neighbour
 MIN_LINK_MATCHES = 60  # agreeing matches across a cut: twice what mapping asks of a single photo
 MIN_MATCHES_FOR_MEDIAN = 8  # of a pair
-# The median error under right poses is 1.2 to 1.7 times the noise of the matches, with the camera model of mapping too
+# The median error under right poses is 1.2 to 2.9 times the noise of the matches, with the camera model of mapping too
 # (docs/experiments/match_graph.md); where it is this many times, and more than MIN_TOLERANCE_PX allows in any case, the
 # poses as a whole are wrong. Then every pair is a little wrong, and none is worse than the others.
-MAX_NOISE_MULTIPLE = 3.0
+MAX_NOISE_MULTIPLE = 4.0
 # So many pairs of consecutive photos, and such a fraction of them, may contradict the poses with at least
 # MIN_STEP_STRENGTH of the matches that consecutive photos have in the median.
 MAX_BROKEN_STEPS, MAX_BROKEN_FRACTION, MIN_STEP_STRENGTH = 2, 0.05, 0.5
