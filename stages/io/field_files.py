@@ -13,6 +13,7 @@ from nerf.effects.appearance import AppearanceModel
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.interface import RadianceModel
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
+from nerf.geometry.space_maps import space_map
 from stages.contract import Progress, StageError
 from stages.effects.image_effects import check_learnt_colours, new_view_effects
 from stages.hardware.backend import BackendName, backend_name, backend_of_field, load_backend
@@ -28,7 +29,7 @@ def save_field(folder: Path, model: RadianceModel, info: dict[str, Any]) -> None
     """
     if not isinstance(model, VanillaNerf | HashGridField):
         raise TypeError(f"no file format for a {type(model).__name__}")
-    kind = {"kind": "paper"}
+    kind = {"kind": "vanilla"}
     if isinstance(model, HashGridField):
         kind = {"kind": "grid", "backend": backend_name(model.backend)}
     weights = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
@@ -80,18 +81,18 @@ def _untrained(
     """The field that ``info`` describes; ``stored`` is the size of its weights in bytes, which it must not exceed.
     Raises ValueError, before anything is allocated."""
     kind, settings = info["kind"], info["settings"]
-    if kind not in ("grid", "paper"):
+    if kind not in ("grid", "vanilla"):
         raise ValueError(f"a field of kind {kind!r} is unknown to this version")
-    text = json.dumps(settings)
+    text, named = json.dumps(settings), settings | {"space": space_map(**settings["space"])}
     if kind == "grid":
-        grid = HashGridSettings(**settings)  # which refuses unknown names; their types are checked next
-        TypeAdapter(HashGridSettings).validate_json(text, strict=True)
+        HashGridSettings(**named)  # which refuses unknown names; their types are checked next
+        grid = TypeAdapter(HashGridSettings).validate_json(text, strict=True)
         _check_size(grid.layout.rows * grid.features_per_level, stored)
         return HashGridField(grid, 0, load_backend(backend_of_field(_trained_with(info), device, progress), device))
-    paper = VanillaSettings(**settings)
-    TypeAdapter(VanillaSettings).validate_json(text, strict=True)
-    _check_size(paper.depth * paper.width**2, stored)
-    return VanillaNerf(paper, seed=0)
+    VanillaSettings(**named)
+    vanilla = TypeAdapter(VanillaSettings).validate_json(text, strict=True)
+    _check_size(vanilla.depth * vanilla.width**2, stored)
+    return VanillaNerf(vanilla, seed=0)
 
 
 def _trained_with(info: dict[str, Any]) -> BackendName:

@@ -30,6 +30,15 @@ def camera_rays(camera: Camera, width: int, height: int) -> Float[np.ndarray, "h
     return rays
 
 
+def border_rays(camera: Camera) -> Float[np.ndarray, "border 3"]:
+    """Unit ray directions of pixel centres along the outline of a camera's image, CHECKED_PIXELS of them a side."""
+    sides = zip((camera.width, camera.height), CHECKED_PIXELS, strict=True)
+    x, y = (np.linspace(0.5, length - 0.5, count) for length, count in sides)
+    across = [np.stack([x, np.full_like(x, end)], axis=1) for end in (y[0], y[-1])]
+    down = [np.stack([np.full_like(y, end), y], axis=1) for end in (x[0], x[-1])]
+    return _ray_directions(native(camera), np.concatenate(across + down))[0]
+
+
 def share_without_ray(model: pycolmap.Camera) -> float:
     """Of a camera's pixels, seen at CHECKED_PIXELS of them, the share for which the camera model has no inverse."""
     sides = zip((model.width, model.height), CHECKED_PIXELS, strict=True)
