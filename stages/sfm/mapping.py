@@ -80,8 +80,8 @@ def _comparison(model: Any, other: Any, database: Path, state: JobState) -> dict
     how many verified pairs agree with either."""
     compared = compare_models(model, other) | {"failed": None, "agreeing": None, "agreeing_other": None}
     if compared["different"]:
-        both = ((one, check_model(one, database, state.job.seed)) for one in (model, other))
-        compared["agreeing"], compared["agreeing_other"] = agreeing_pairs(*both, compared["different"])
+        taken, rejected = ((one, check_model(one, database, state.job.seed)) for one in (model, other))
+        compared["agreeing"], compared["agreeing_other"] = agreeing_pairs(taken, rejected, compared["different"])
     return compared
 
 
