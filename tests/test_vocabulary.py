@@ -40,7 +40,7 @@ EFFECTS: dict[str, str] = {
     r"\b(PhotoRays|PhotoColours|AsGiven|AsRendered|photo_parts)\b": "ImageEffects",
     r"\b(Exposures|RefinedPoses)\b": "ExposureModel, PoseRefinement",
     r"neutral exposure": "reference exposure",
-    r"\b(HARM|SURE|GREY)\b": "MIN_EFFECT, MIN_SIGNAL_TO_NOISE, GREY_ZONE",
+    r"\b(HARM|SURE)\b": "MIN_EFFECT, MIN_SIGNAL_TO_NOISE",
     r"\b_?judged\(": "classify",
     r"(?i)two.?way\b": "additive view/point model",
     r"\b(Odd|odd_photos)\b": "outlier images",
