@@ -53,7 +53,7 @@ def samples_of(model: RadianceModel) -> str:
         return samples_of(model.model)
     if isinstance(model, HashGridField):
         step, bounded = model.render_stepping.step_size, f"{model.settings.diagonal_steps} along the box's diagonal"
-        return f"steps from {step:.4f}" if model.settings.contracted else bounded
+        return f"steps from {step:.4f}" if model.space.bends_rays else bounded
     assert isinstance(model, VanillaNerf)
     return f"{model.settings.samples_coarse} + {model.settings.samples_fine}"
 

@@ -16,8 +16,8 @@ from typing import Any
 from PIL import Image
 
 from benchmarks.record import Record, add_out
-from pipeline.cli.display import PlainDisplay
-from pipeline.cli.settings import settings_from, with_source
+from pipeline.cli.options import settings_from, with_source
+from pipeline.cli.terminal import PlainDisplay
 from pipeline.engine.runner import Runner
 from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import Workspace

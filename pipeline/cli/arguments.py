@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 import tyro
 from pydantic import ValidationError
 
-from pipeline.cli.settings import UsageError, wrong_options
+from pipeline.cli.options import UsageError, wrong_options
 from pipeline.engine.settings import Settings
 from stages.render import Config as RenderConfig
 from stages.train.config import GRID_ONLY, PAPER_ONLY

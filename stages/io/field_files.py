@@ -13,6 +13,7 @@ from nerf.effects.appearance import AppearanceModel
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.interface import RadianceModel
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
+from nerf.geometry.space_maps import space_map
 from stages.contract import Progress, StageError
 from stages.effects.image_effects import check_learnt_colours, new_view_effects
 from stages.hardware.backend import BackendName, backend_name, backend_of_field, load_backend
@@ -82,14 +83,14 @@ def _untrained(
     kind, settings = info["kind"], info["settings"]
     if kind not in ("grid", "paper"):
         raise ValueError(f"a field of kind {kind!r} is unknown to this version")
-    text = json.dumps(settings)
+    text, named = json.dumps(settings), settings | {"space": space_map(**settings["space"])}
     if kind == "grid":
-        grid = HashGridSettings(**settings)  # which refuses unknown names; their types are checked next
-        TypeAdapter(HashGridSettings).validate_json(text, strict=True)
+        HashGridSettings(**named)  # which refuses unknown names; their types are checked next
+        grid = TypeAdapter(HashGridSettings).validate_json(text, strict=True)
         _check_size(grid.layout.rows * grid.features_per_level, stored)
         return HashGridField(grid, 0, load_backend(backend_of_field(_trained_with(info), device, progress), device))
-    paper = VanillaSettings(**settings)
-    TypeAdapter(VanillaSettings).validate_json(text, strict=True)
+    VanillaSettings(**named)
+    paper = TypeAdapter(VanillaSettings).validate_json(text, strict=True)
     _check_size(paper.depth * paper.width**2, stored)
     return VanillaNerf(paper, seed=0)
 

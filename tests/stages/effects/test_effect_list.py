@@ -10,7 +10,7 @@ import torch
 
 from nerf.effects.appearance import AppearanceModel
 from nerf.effects.exposure import ExposureModel
-from pipeline.cli.settings import Settings, with_effects
+from pipeline.cli.options import Settings, with_effects
 from stages import effects, evaluate, render, train
 from stages.effects.effect_list import EFFECTS, Effect, EffectParts
 from stages.effects.image_effects import photo_effects

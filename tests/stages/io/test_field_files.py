@@ -10,15 +10,16 @@ from nerf.effects.exposure import ExposureModel
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
+from nerf.geometry.space_maps import Contraction
 from stages.contract import StageError
 from stages.hardware.backend import BackendName, backend_name, chosen_backend, load_backend
 from stages.io.field_files import load_field, save_field
 from stages.io.files import read_json, read_tensors, write_json, write_tensors
 from tests.refusals import refused
 
-SMALL = VanillaSettings(depth=2, width=8, samples_coarse=4, samples_fine=4, contracted=True, spacing="log")
+SMALL = VanillaSettings(depth=2, width=8, samples_coarse=4, samples_fine=4, space=Contraction(), spacing="log")
 GRID = HashGridSettings(
-    num_levels=2, log2_hashmap_size=8, base_res=4, max_res=16, contracted=True, occupancy_resolution=8
+    num_levels=2, log2_hashmap_size=8, base_res=4, max_res=16, space=Contraction(), occupancy_resolution=8
 )
 KERNELS = load_backend(chosen_backend("cpu"), "cpu")
 OUTDOORS = HashGridField(replace(GRID, background_model=True), 5, KERNELS)
@@ -40,7 +41,7 @@ def test_a_field_comes_back_the_same(kind: str, tmp_path: Path) -> None:
     assert seen.opacity.min() > 0 and seen.colour.std() > 0
     assert {key: info[key] for key in INFO} == INFO
     assert info["kind"] == ("paper" if kind == "paper" else "grid")
-    assert info["settings"]["contracted"] is True
+    assert info["settings"]["space"] == {"kind": "contraction"}
 
 
 def test_files_are_read_from_folders_whose_names_are_not_unicode(tmp_path: Path) -> None:

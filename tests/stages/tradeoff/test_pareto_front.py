@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.cli.arguments import StageArguments, parse
-from pipeline.cli.settings import with_effects
+from pipeline.cli.options import with_effects
 from pipeline.engine.settings import Settings
 from stages.effects.decisions import Space
 from stages.tradeoff.pareto_front import (

@@ -8,7 +8,7 @@ from PIL import Image
 
 from pipeline.cli.arguments import RunArguments, StageArguments, parse
 from pipeline.cli.commands import run_command
-from pipeline.cli.settings import UsageError, read_toml, with_effects
+from pipeline.cli.options import UsageError, read_toml, with_effects
 from pipeline.engine.settings import Settings
 from stages.effects import Config
 from stages.render import Config as RenderConfig
