@@ -13,7 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from nerf import FULL
+from nerf import MIN_SATURATED
 from nerf.effects.statistics.outlier_images import NEAR_APART, expected_places
 from nerf.effects.statistics.tracks import TrackColours
 from nerf.geometry.scene import Scene, View
@@ -31,7 +31,7 @@ MIN_WINDOW, MAX_WINDOW = 5, 3.0  # pixels; times the usual window
 # dark beside another one is what lamps and the night look like; it hardly weighs (nerf/effects/statistics/tracks.py:
 # log_noise).
 CLIPPED_SHARE = 0.1
-DARKEST, BRIGHTEST = 3, FULL  # of 255
+DARKEST, BRIGHTEST = 3, MIN_SATURATED  # of 255
 DECODING_BYTES = 2 << 30  # of photos in memory at a time
 
 
