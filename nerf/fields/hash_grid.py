@@ -225,7 +225,7 @@ class HashGridField(nn.Module):
         density = self._density_pass(unit.clamp(0, 1))
         of_rays = mlp.ray_hidden(self.weights, self.of_directions(directions.reshape(-1, 3).contiguous()))
         each = torch.arange(len(unit), dtype=torch.int32, device=unit.device)  # a ray of its own for every point
-        colour = mlp.colour_of(self.weights, each, density.geometry, of_rays)
+        colour = mlp.colour_of(self.weights, self.backend, each, density.geometry, of_rays)
         return torch.where(sampled, density.sigma, 0).view(points.shape[:-1]), colour.view(points.shape)
 
     def _located(self, points: Float[Tensor, "*points 3"]) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
@@ -251,8 +251,8 @@ class HashGridField(nn.Module):
         for samples, _, density in self._march(rays, torch.full_like(rays.near, 0.5), self.render_stepping):
             with span("composite"):
                 selected = backend.select_colour_samples(samples, density.sigma, OPACITY_STEP, depth, accumulated)
-                geometry = density.geometry.index_select(0, selected.rows)
-            colour = mlp.colour_of(self.weights, selected.samples.ray, geometry, of_rays)
+                geometry = backend.gather_rows(density.geometry, selected.rows)
+            colour = mlp.colour_of(self.weights, backend, selected.samples.ray, geometry, of_rays)
             with span("composite"):
                 backend.accumulate_colours(selected, colour, rendered)
         transmittance, opacity = (each.to(rendered.dtype) for each in (torch.exp(-depth), -torch.expm1(-depth)))
@@ -280,8 +280,9 @@ class HashGridField(nn.Module):
             )
             rows = order.index_select(0, seen)
             points = torch.cat([each.points for each in rounds]).index_select(0, rows)
-            of_rounds = zip(*(each.density for each in rounds), strict=True)
-            density = DensityPass(*(torch.cat(parts).index_select(0, rows) for parts in of_rounds))
+            features = backend.gather_rows(torch.cat([each.density.features for each in rounds]), rows)
+            geometry = backend.gather_rows(torch.cat([each.density.geometry for each in rounds]), rows)
+            density = DensityPass(features, geometry, sigma.index_select(0, seen))
             thickness = density.sigma * marched.dt.index_select(0, seen)
         with span("encode"):
             harmonics = self.of_directions(rays.directions)

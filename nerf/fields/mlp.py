@@ -143,6 +143,7 @@ def colour_forward(
 
 def colour_of(
     weights: Weights,
+    backend: Backend,
     ray: Int32[Tensor, "samples"],
     geometry: Float[Tensor, "samples geometry"],
     of_rays: Float[Tensor, "rays hidden"],
@@ -151,7 +152,7 @@ def colour_of(
     with span("mlp", WorkCounts(matmul_flops=colour_flops(weights) * len(geometry))):
         logits = geometry.new_empty(len(geometry), 3)
         for rows in _blocks(geometry):
-            hidden = of_rays.index_select(0, ray[rows]).addmm_(geometry[rows], weights.colour_hidden[:GEOMETRY])
+            hidden = backend.gather_rows(of_rays, ray[rows]).addmm_(geometry[rows], weights.colour_hidden[:GEOMETRY])
             torch.mm(hidden.relu_(), weights.colour_out.T, out=logits[rows])
         return logits.sigmoid_()
 

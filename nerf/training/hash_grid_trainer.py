@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass
 from functools import partial
-from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import torch
@@ -155,10 +154,6 @@ class HashGridTrainer:
         self.exp_avg = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.exp_avg_sq = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.grad_table = torch.zeros_like(model.table)
-        tables = model.table, self.grad_table, self.exp_avg["table"], self.exp_avg_sq["table"]
-        self.levels = [
-            tuple(tensor[first:end] for tensor in tables) for first, end in pairwise(model.layout.first_rows)
-        ]
         self.samples_per_ray = torch.tensor(INITIAL_SAMPLES_PER_RAY, dtype=torch.float64)
         self.order = PixelSampler(self.dataset.unmasked_count, settings.seed, dataset.device)
         self.drawn = torch.tensor(0)  # pixels of that order so far; steps differ in how many they take
@@ -303,11 +298,13 @@ class HashGridTrainer:
         return loss_now, error_now
 
     def _update(self, parts: Sequence[_Part], factor: float, adam_step: int) -> None:
-        """Update the table's levels, which progress no rows, the networks, the per-image parameters and the occupancy
-        grid, each on a core. ``factor`` scales all learning rates."""
-        finest_first = range(len(self.model.layout.resolutions) - 1, -1, -1)  # no core waits long for the last
+        """Update the table's levels, which share no rows, the networks, the per-image parameters and the occupancy
+        grid, each on a core; on a GPU all levels at once. ``factor`` scales all learning rates."""
+        levels = range(len(self.model.layout.resolutions))
+        finest_first = [levels[level : level + 1] for level in reversed(levels)]  # no core waits long for the last
+        together = [levels] if self.dataset.device.type == "cuda" else finest_first
         learning_rate = self.settings.rate * factor
-        work = [partial(self._update_level, level, parts, learning_rate, adam_step) for level in finest_first]
+        work = [partial(self._update_levels, some, parts, learning_rate, adam_step) for some in together]
         of_networks = [chunk.weights._asdict() for chunk in parts]
         work.append(partial(self._update_small, Weights._fields, of_networks, learning_rate, adam_step))
         of_background = [*(chunk.background for chunk in parts), self._background_prior(parts)]
@@ -328,12 +325,14 @@ class HashGridTrainer:
         }
         return {name: BACKGROUND_PRIOR / rays * table * touched[name] for name, table in self.background.items()}
 
-    def _update_level(self, level: int, parts: Sequence[_Part], learning_rate: float, adam_step: int) -> None:
+    def _update_levels(self, levels: range, parts: Sequence[_Part], learning_rate: float, adam_step: int) -> None:
         layout, backend = self.model.layout, self.model.backend
-        with span("scatter", WorkCounts(gathered_rows=CORNERS * sum(len(each.points) for each in parts))):
+        with span("scatter", WorkCounts(gathered_rows=CORNERS * len(levels) * sum(len(each.points) for each in parts))):
             for each in parts:
-                backend.encode_backward_table(layout, level, each.points, each.features, self.grad_table)
-        table, grad, exp_avg, exp_avg_sq = self.levels[level]
+                backend.encode_backward_table(layout, levels, each.points, each.features, self.grad_table)
+        tables = self.model.table, self.grad_table, self.exp_avg["table"], self.exp_avg_sq["table"]
+        rows = slice(layout.first_rows[levels.start], layout.first_rows[levels.stop])
+        table, grad, exp_avg, exp_avg_sq = (tensor[rows] for tensor in tables)
         with span("optimiser", WorkCounts(streamed_bytes=ADAM_BYTES * table.numel())):
             backend.adam(table, grad, exp_avg, exp_avg_sq, learning_rate, adam_step)
 
