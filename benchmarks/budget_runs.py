@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from nerf.effects import HeldOutImages
 from nerf.fields.hash_grid import HashGridField
 from nerf.geometry.scene import Scene
 from nerf.training import hash_grid_trainer
@@ -27,7 +28,8 @@ from nerf.training.ray_dataset import RayDataset
 from nerf.training.schedule import schedule_of
 from nerf.training.trainer import FieldTrainer
 from nerf.training.validation_probe import Probe, make_probe, measure
-from stages.effects.decisions import Decisions, image_effects, read_decisions, told_by_neighbours
+from stages.effects.decisions import Decisions, read_decisions
+from stages.effects.image_effects import held_out_images, image_effects
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.hardware.device import compute_device
 from stages.io.files import read_json, read_scene
@@ -65,7 +67,7 @@ class Bench(NamedTuple):
     decisions: Decisions
     dataset: RayDataset
     probe: Probe
-    neighbours: torch.Tensor
+    held_out: HeldOutImages
 
 
 def bench_of(workspace: Path) -> Bench:
@@ -90,7 +92,9 @@ def bench_of(workspace: Path) -> Bench:
     test = training_dataset(inputs["ingest"], scene, "test", downscale, Quiet())
     shown_over = torch.tensor(field_background(config, scene))
     probe = make_probe(test, PROBE_RAYS, shown_over, seed=0)
-    return Bench(config, scene, decisions, train, probe, told_by_neighbours(scene, scene.of_split("test")))
+    return Bench(
+        config, scene, decisions, train, probe, held_out_images(scene.of_split("train"), scene.of_split("test"))
+    )
 
 
 class RunningMean:
@@ -128,7 +132,7 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
             for mean in means.values():
                 mean.add(step + 1)
         if step + 1 in due:
-            as_expected = trainer.effects.of_held_out(bench.neighbours)
+            as_expected = trainer.effects.of_held_out(bench.held_out)
             models = {"heldout_psnr": trainer.model} | {name: mean.model for name, mean in means.items()}
             psnr = {name: measure(model, bench.probe, as_expected).psnr for name, model in models.items()}
             points.append({"step": step + 1, "train_psnr": pace, **psnr})

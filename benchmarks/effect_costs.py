@@ -22,7 +22,8 @@ from nerf.geometry.scene import Scene
 from nerf.runtime.matmul_precision import use_matmul_precision
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import FieldTrainer
-from stages.effects.decisions import Decisions, image_effects
+from stages.effects.decisions import Decisions
+from stages.effects.image_effects import image_effects
 from stages.train import Config
 from stages.train.fields import make_trainer
 

@@ -22,7 +22,8 @@ from nerf.runtime.machine_rates import measure_rates
 from nerf.runtime.matmul_precision import use_matmul_precision
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import FieldTrainer
-from stages.effects.decisions import Decisions, image_effects, read_decisions
+from stages.effects.decisions import Decisions, read_decisions
+from stages.effects.image_effects import image_effects
 from stages.hardware.device import compute_device, cores
 from stages.io.files import read_scene
 from stages.train import Config, plan

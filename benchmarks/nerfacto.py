@@ -69,7 +69,7 @@ def train_ours(workspace: Path, downscale: float, seconds: float) -> Point:
 def score_ours(workspace: Path) -> float:
     """Mean PSNR over the held-out photos at the trained size, as stage evaluate scores them."""
     from nerf.training.metrics import mean_squared_error, psnr
-    from stages.effects.decisions import expected_gains
+    from stages.effects.image_effects import photo_effects
     from stages.io.files import read_json, read_scene
     from stages.render.renderer import load_renderer
     from stages.train.config import WHITE
@@ -77,13 +77,12 @@ def score_ours(workspace: Path) -> float:
 
     scene, train = read_scene(stage_folder(workspace, "scene.json")), stage_folder(workspace, "curve.json")
     renderer, info = load_renderer(train), read_json(train / "field.json")
-    gains = expected_gains(info, scene, scene.of_split("test"))
     ingest, values = stage_folder(workspace, "photos.json"), []
     reader = PhotoReader(ingest, scene, info["downscale"])
     for view in scene.of_split("test"):
         truth = reader.pixels(view, WHITE)
-        at_gain = renderer.at_gain(gains[view.name]) if gains else renderer
-        picture = at_gain.draw(view_rays(scene, view, info["downscale"])).colour.clamp(0, 1)
+        shown = renderer.through(photo_effects(info, scene, view, renderer.device))
+        picture = shown.draw(view_rays(scene, view, info["downscale"])).colour.clamp(0, 1)
         values.append(psnr(mean_squared_error(picture, truth)))
     return sum(values) / len(values)
 

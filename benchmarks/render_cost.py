@@ -22,7 +22,7 @@ from nerf.fields.vanilla import VanillaNerf
 from nerf.training.metrics import mean_squared_error, psnr
 from pipeline.engine.workspace import Workspace
 from stages.amounts import resolution_name
-from stages.effects.decisions import expected_gains
+from stages.effects.image_effects import photo_effects
 from stages.io.files import read_json, read_scene
 from stages.io.photos import spread
 from stages.render.renderer import Renderer, load_renderer
@@ -53,7 +53,7 @@ def samples_of(model: RadianceModel) -> str:
         return samples_of(model.model)
     if isinstance(model, HashGridField):
         step, bounded = model.render_stepping.step_size, f"{model.settings.diagonal_steps} along the box's diagonal"
-        return f"steps from {step:.4f}" if model.settings.contracted else bounded
+        return f"steps from {step:.4f}" if model.space.bends_rays else bounded
     assert isinstance(model, VanillaNerf)
     return f"{model.settings.samples_coarse} + {model.settings.samples_fine}"
 
@@ -62,11 +62,11 @@ def measured(renderer: Renderer, folders: dict[str, Path], downscale: float, pho
     """Mean seconds a frame and mean PSNR (dB) over ``photos`` test photos."""
     scene = read_scene(folders["normalise"])
     test = scene.of_split("test")
-    gains = expected_gains(read_json(folders["train"] / "field.json"), scene, test)
+    info = read_json(folders["train"] / "field.json")
     reader, seconds, scores = PhotoReader(folders["ingest"], scene, downscale), [], []
     for index in spread(len(test), min(photos, len(test))):
         view = test[index]
-        shown = renderer.at_gain(gains[view.name]) if gains else renderer
+        shown = renderer.through(photo_effects(info, scene, view, renderer.device))
         rays = view_rays(scene, view, downscale)
         truth = reader.pixels(view, renderer.background.tolist())
         started = time.perf_counter()

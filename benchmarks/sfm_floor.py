@@ -75,10 +75,10 @@ def operations(first: np.ndarray, second: np.ndarray) -> float:
     return 2.0 * 129 * len(first) * (len(second) + len(np.unique(nearest[distinct])))
 
 
-def blurred(path: Path, photo: Photo, search: ExtractionOptions) -> None:
+def blurred(path: Path, photo: Photo, extraction: ExtractionOptions) -> None:
     """All pictures in which features would be looked for."""
     size = max(photo.width, photo.height)
-    scale = 2.0 if size <= search.doubled_up_to else min(1.0, search.max_image_size / size)
+    scale = 2.0 if size <= extraction.doubled_up_to else min(1.0, extraction.max_image_size / size)
     read = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.float32)
     octave = [cv2.resize(read, None, fx=scale, fy=scale)]
     sigmas = [SIGMA * 2 ** (number / SCALES) for number in range(SCALES + 3)]
@@ -90,16 +90,16 @@ def blurred(path: Path, photo: Photo, search: ExtractionOptions) -> None:
 
 def compare(photos: list[Photo], folder: Path, database: Path, record: Record) -> None:
     """Record the rows of the table."""
-    cores, search = processors(), ExtractionOptions(*QUALITY_LEVELS[0])
+    cores, extraction = processors(), ExtractionOptions(*QUALITY_LEVELS[0])
     fill_database(database, photos, MAPPING_MODEL)
-    finding = seconds(lambda: extract_features(database, folder / "images", photos, search), 1)
+    finding = seconds(lambda: extract_features(database, folder / "images", photos, extraction), 1)
     with pycolmap.Database.open(database) as db:
         descriptors = [read_descriptors(db, number) for number in range(len(photos))]
     pairs = list(combinations(range(len(photos)), 2))
     matching_all = seconds(lambda: match_pairs(database, exhaustive(len(photos)), 0, STRICT_RATIO), 1)
     with ThreadPoolExecutor(cores) as pool:
         cv2.setNumThreads(1)
-        blurring = seconds(lambda: list(pool.map(lambda p: blurred(folder / p.file, p, search), photos)), 2)
+        blurring = seconds(lambda: list(pool.map(lambda p: blurred(folder / p.file, p, extraction), photos)), 2)
         rate = products_per_second(pool, cores)
 
         def match(pair: tuple[int, int]) -> None:

@@ -10,7 +10,7 @@ which autograd may differentiate (the vanilla NeRF's trainer does so); the backw
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -28,12 +28,20 @@ class RayGradients(NamedTuple):
     directions: Float[Tensor, "rays 3"]
 
 
-class TrainingImages(NamedTuple):
-    """What effects may begin from: the calibrated cameras of the training images, and how far away (scene units) is
-    what each of them shows; None: nobody knows."""
+class Images(NamedTuple):
+    """What effects may know of images: their calibrated poses, and how far away (scene units) is what each of them
+    shows; None: nobody knows."""
 
     scene_from_camera: Float[Tensor, "views 3 4"]
     viewing_distance: Float[Tensor, "views"] | None = None
+
+
+class HeldOutImages(NamedTuple):
+    """Images that took no part in training, and how much each training image tells of each of them
+    (nerf/geometry/pose_distance.py)."""
+
+    images: Images
+    weights: Float[Tensor, "held_out views"]
 
 
 class RenderedRays(NamedTuple):
@@ -47,12 +55,10 @@ class RenderedRays(NamedTuple):
 
 @runtime_checkable
 class RayEffect(Protocol):
-    """Where the rays of each image run."""
+    """Where the rays of each image run. ``name`` and ``learning_rate`` as of a :class:`ColourEffect`."""
 
-    @property
-    def name(self) -> str:
-        """What the effect is called everywhere (stages/effects/effect_list.py)."""
-        ...
+    name: ClassVar[str]
+    learning_rate: ClassVar[float]
 
     @property
     def parameters(self) -> dict[str, Float[Tensor, "views _"]]:
@@ -60,13 +66,13 @@ class RayEffect(Protocol):
         ...
 
     @property
-    def learning_rate(self) -> float:
-        """Adam's learning rate for them before the field's warm-up and decay."""
-        ...
-
-    @property
     def rows(self) -> Float[Tensor, "views _"]:
         """What was learnt of each image, in the units of files."""
+        ...
+
+    @classmethod
+    def initial(cls, images: Images, measured: Float[Tensor, "views _"] | None) -> "RayEffect":
+        """What training begins with; ``measured``: what statistics say of each image, if they do."""
         ...
 
     def fix_gauge(self) -> None:
@@ -88,12 +94,16 @@ class RayEffect(Protocol):
 
 @runtime_checkable
 class ColourEffect(Protocol):
-    """What each image makes of the scene's radiance along its rays."""
+    """What each image makes of the scene's radiance along its rays.
 
-    @property
-    def name(self) -> str:
-        """What the effect is called everywhere (stages/effects/effect_list.py)."""
-        ...
+    ``name``: what the effect is called everywhere (stages/effects/effect_list.py); ``learning_rate``: Adam's for its
+    parameters, before the field's warm-up and decay; ``row_length``: how many numbers files have of an image;
+    ``held_out_words``: how images that took no part in training are shown."""
+
+    name: ClassVar[str]
+    learning_rate: ClassVar[float]
+    row_length: ClassVar[int]
+    held_out_words: ClassVar[str]
 
     @property
     def parameters(self) -> dict[str, Float[Tensor, "views _"]]:
@@ -101,32 +111,37 @@ class ColourEffect(Protocol):
         ...
 
     @property
-    def learning_rate(self) -> float:
-        """Adam's learning rate for them before the field's warm-up and decay."""
-        ...
-
-    @property
     def rows(self) -> Float[Tensor, "views _"]:
-        """What was learnt of each image, in the units of files: what the effect is made of again."""
+        """What was learnt of each image, in the units of files."""
         ...
 
-    @property
-    def reference(self) -> Float[Tensor, "_"]:
-        """The row at which the field is shown where no image is meant."""
+    @classmethod
+    def initial(cls, images: Images, measured: Float[Tensor, "views _"] | None) -> "ColourEffect":
+        """What training begins with; ``measured``: what statistics say of each image, if they do."""
         ...
 
-    @property
-    def reference_sentence(self) -> str:
-        """What that is, in words."""
+    @classmethod
+    def restored(cls, images: Images, rows: Float[Tensor, "views _"]) -> "ColourEffect":
+        """From what was learnt of ``images``."""
+        ...
+
+    @classmethod
+    def of_new_view(cls, rows: Float[Tensor, "views _"]) -> "ColourEffect | None":
+        """What a view shows that no camera took, by ``rows`` of one image that it is to be like, or of all. None: it
+        shows the scene without the effect."""
+        ...
+
+    @classmethod
+    def new_view_words(cls, rows: Float[Tensor, "views _"]) -> str:
+        """What that is, by the rows of all images."""
         ...
 
     def fix_gauge(self) -> None:
         """After an update: take out what the field could take up itself."""
         ...
 
-    def of_held_out(self, weights: Float[Tensor, "held_out views"]) -> "ColourEffect":
-        """Of images that took no part, from what ``weights`` says of their neighbours among those that did
-        (nerf/geometry/pose_distance.py)."""
+    def of_held_out(self, held_out: HeldOutImages) -> "ColourEffect":
+        """Of images that took no part: what they are expected to show."""
         ...
 
     def forward(
@@ -213,10 +228,9 @@ class ImageEffects(NamedTuple):
         opacity = ((of_colour - grad) * seen.background).sum(-1)  # it moves both terms
         return Rendering(of_colour, none, opacity), gradients
 
-    def of_held_out(self, weights: Float[Tensor, "held_out views"]) -> "ImageEffects":
-        """What images that took no part are expected to show, from what ``weights`` says of their neighbours; their
-        cameras count as calibrated."""
-        return ImageEffects(colours=tuple(effect.of_held_out(weights) for effect in self.colours))
+    def of_held_out(self, held_out: HeldOutImages) -> "ImageEffects":
+        """What images that took no part are expected to show; their poses count as calibrated."""
+        return ImageEffects(colours=tuple(effect.of_held_out(held_out) for effect in self.colours))
 
     @staticmethod
     def _stages(seen: RenderedRays, effects: tuple[ColourEffect, ...]) -> list[Float[Tensor, "rays 3"]]:

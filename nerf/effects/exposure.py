@@ -13,13 +13,13 @@ bright. So gains are kept as they are above the least one of each channel, which
 """
 
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerf.effects import TrainingImages
+from nerf.effects import HeldOutImages, Images
 from nerf.geometry.rays import Rays
 from nerf.rendering.srgb import KNEE, OFFSET, POWER, SLOPE, linear_to_srgb, srgb_to_linear
 
@@ -38,19 +38,37 @@ class ExposureModel:
     """A :class:`nerf.effects.ColourEffect`. ``log_gain``: natural logarithms of gains in linear light, a row per
     view."""
 
-    name = "exposure"
-    learning_rate = LEARNING_RATE
+    name: ClassVar = "exposure"
+    learning_rate: ClassVar = LEARNING_RATE
+    row_length: ClassVar = 3
+    held_out_words: ClassVar = "exposed as the photos taken nearest by"
 
     def __init__(self, log_gain: Float[Tensor, "views 3"]) -> None:
         self.log_gain = log_gain.clone()
         self.mean = self.log_gain.mean(0)
 
     @classmethod
-    def initial(cls, images: TrainingImages, measured: Float[Tensor, "views 3"] | None) -> "ExposureModel":
+    def initial(cls, images: Images, measured: Float[Tensor, "views 3"] | None) -> "ExposureModel":
         """From gains that are known up to a factor per channel; None: all alike."""
         if measured is None:
             measured = torch.zeros_like(images.scene_from_camera[:, :, 3])
         return cls(measured - measured.amin(0))
+
+    @classmethod
+    def restored(cls, images: Images, rows: Float[Tensor, "views 3"]) -> "ExposureModel":
+        """Gains as they were learnt."""
+        return cls(rows)
+
+    @classmethod
+    def of_new_view(cls, rows: Float[Tensor, "views 3"]) -> "ExposureModel":
+        """The reference exposure: the median over the photos, per channel."""
+        return cls(rows.median(0).values[None])
+
+    @classmethod
+    def new_view_words(cls, rows: Float[Tensor, "views 3"]) -> str:
+        """In stops (EV) above the photo with the least exposure, the three channels on the mean."""
+        stops = float(rows.median(0).values.double().mean() - rows.double().mean(1).min()) / math.log(2)
+        return f"reference exposure, {round(stops, 2) + 0.0:+.2f} EV over the least exposed photo"  # no -0
 
     @property
     def parameters(self) -> dict[str, Float[Tensor, "views 3"]]:
@@ -62,24 +80,13 @@ class ExposureModel:
         """The same."""
         return self.log_gain
 
-    @property
-    def reference(self) -> Float[Tensor, "3"]:
-        """The reference exposure: the median over the photos, per channel."""
-        return self.log_gain.median(0).values
-
-    @property
-    def reference_sentence(self) -> str:
-        """In stops (EV) above the photo with the least exposure, the three channels on the mean."""
-        stops = float(self.reference.double().mean() - self.log_gain.double().mean(1).min()) / math.log(2)
-        return f"reference exposure, {round(stops, 2) + 0.0:+.2f} EV over the least exposed photo"  # no -0
-
     def fix_gauge(self) -> None:
         """Keep the mean: a field twice as bright under gains half as large shows the same."""
         self.log_gain -= self.log_gain.mean(0) - self.mean
 
-    def of_held_out(self, weights: Float[Tensor, "held_out views"]) -> "ExposureModel":
+    def of_held_out(self, held_out: HeldOutImages) -> "ExposureModel":
         """Gains like those of the photos taken nearest by: a camera that sets its exposure sees there what they saw."""
-        return ExposureModel(weights.to(self.log_gain) @ self.log_gain)
+        return ExposureModel(held_out.weights.to(self.log_gain) @ self.log_gain)
 
     def forward(
         self, colour: Float[Tensor, "rays 3"], rays: Rays, view: Int[Tensor, "rays"]

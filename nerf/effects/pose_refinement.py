@@ -11,12 +11,13 @@ would move the picture 25 times as far as a step of turn, and shake what turns h
 """
 
 from operator import itemgetter
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf.effects import NO_EFFECTS, ImageEffects, RayGradients, RenderedRays, TrainingImages
+from nerf.effects import NO_EFFECTS, ImageEffects, Images, RayGradients, RenderedRays
 from nerf.fields.hash_grid import HashGridField
 from nerf.geometry.rays import Rays
 from nerf.geometry.rotations import rotation_from_vector
@@ -36,8 +37,8 @@ class PoseRefinement:
     """A :class:`nerf.effects.RayEffect` that begins at the calibrated poses, whose cameras stand at ``centres`` and see
     what is at a ``distance`` (scene units; None: nobody knows, and units are the largest)."""
 
-    name = "pose_refinement"
-    learning_rate = LEARNING_RATE
+    name: ClassVar = "pose_refinement"
+    learning_rate: ClassVar = LEARNING_RATE
 
     def __init__(self, centres: Float[Tensor, "views 3"], distance: Float[Tensor, "views"] | None = None) -> None:
         self.turn, self.offset = torch.zeros_like(centres), torch.zeros_like(centres)
@@ -46,7 +47,7 @@ class PoseRefinement:
         self.gauge = _gauge(centres, self.unit)
 
     @classmethod
-    def initial(cls, images: TrainingImages, measured: Tensor | None = None) -> "PoseRefinement":
+    def initial(cls, images: Images, measured: Tensor | None = None) -> "PoseRefinement":
         """No correction: nothing is measured."""
         return cls(images.scene_from_camera[:, :, 3].contiguous(), images.viewing_distance)
 

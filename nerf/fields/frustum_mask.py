@@ -1,4 +1,4 @@
-"""Where a field of contracted space may put things, by how many photos look there.
+"""Where a field of unbounded space may put things, by how many photos look there.
 
 What one photo alone sees can be explained by something at any distance, also right before its camera; and what two see
 often can, where it is dark or plain. A field puts it there, in the way of every other view. (Philip and Deschaintre
@@ -14,9 +14,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from nerf.geometry.contraction import uncontract
 from nerf.geometry.near_far import NEAR_MARGIN
-from nerf.kernels import CONTRACTED_BOX
+from nerf.geometry.space_maps import SpaceMap
 from nerf.kernels.torch.occupancy import cell_corners, grown
 from nerf.runtime.parallel import in_order
 from nerf.training.ray_dataset import RayDataset
@@ -27,22 +26,23 @@ TOGETHER = 16  # photos that look at once, on all cores, at what is undecided; f
 
 
 # Of datasets that are in use, by their geometry: all trainers of a run ask for the same, and so do all of its pilots.
-_answers: MutableMapping[Tensor, dict[tuple[int, int], Tensor]] = WeakTensorKeyDictionary()
+_answers: MutableMapping[Tensor, dict[tuple[SpaceMap, int, int], Tensor]] = WeakTensorKeyDictionary()
 
 
-def compute_frustum_mask(dataset: RayDataset, least: int, cells: int) -> Bool[Tensor, "cells"]:
-    """Which of ``cells``³ contracted cells, in the order of ``nerf.kernels.torch.occupancy``, may hold something:
-    those whose middles ``least`` photos of ``dataset`` look at, or one, from where its foreground begins; and a coarse
-    cell around them. What hides them, and masks, count for nothing. Found once for a dataset; not to be written to."""
+def compute_frustum_mask(dataset: RayDataset, space: SpaceMap, least: int, cells: int) -> Bool[Tensor, "cells"]:
+    """Which of ``cells``³ cells of an unbounded ``space``, in the order of ``nerf.kernels.torch.occupancy``, may hold
+    something: those whose middles ``least`` photos of ``dataset`` look at, or one, from where its foreground begins;
+    and a coarse cell around them. What hides them, and masks, count for nothing. Found once for a dataset; not to be
+    written to."""
     answers = _answers.setdefault(dataset.geometry, {})
-    if (least, cells) not in answers:
-        answers[least, cells] = _compute_frustum_mask(dataset, least, cells)
-    return answers[least, cells]
+    if (space, least, cells) not in answers:
+        answers[space, least, cells] = _compute_frustum_mask(dataset, space, least, cells)
+    return answers[space, least, cells]
 
 
-def _compute_frustum_mask(dataset: RayDataset, least: int, cells: int) -> Bool[Tensor, "cells"]:
+def _compute_frustum_mask(dataset: RayDataset, space: SpaceMap, least: int, cells: int) -> Bool[Tensor, "cells"]:
     side, views = min(SIDE, cells), range(len(dataset.near))
-    middles = _middles(side, dataset.device)
+    middles = _middles(space, side, dataset.device)
     undecided = torch.arange(side**3, device=dataset.device)
     photos = torch.zeros_like(undecided)
     for first in range(0, len(views), TOGETHER):
@@ -60,10 +60,11 @@ def _compute_frustum_mask(dataset: RayDataset, least: int, cells: int) -> Bool[T
     return grown(usable.view(side, side, side))[x, y, z]
 
 
-def _middles(side: int, device: torch.device) -> Float[Tensor, "3 cells"]:
+def _middles(space: SpaceMap, side: int, device: torch.device) -> Float[Tensor, "3 cells"]:
     """Where the middles of side³ cells of the unit cube are in the scene."""
-    line = 2 * CONTRACTED_BOX * ((torch.arange(side, device=device) + 0.5) / side - 0.5)
-    return uncontract(torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1)).flatten(0, 2).T.contiguous()
+    line = 2 * space.half * ((torch.arange(side, device=device) + 0.5) / side - 0.5)
+    middles = space.inverse(torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1))
+    return middles.flatten(0, 2).T.contiguous()
 
 
 def _looked_at(

@@ -6,7 +6,7 @@ its occupied cells alone, and the density found there decides how far along a ra
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -18,8 +18,8 @@ from nerf.fields.background import background_backward, background_colour, direc
 from nerf.fields.interface import Rendering
 from nerf.fields.mlp import ColourPass, DensityPass, Weights
 from nerf.geometry.rays import Rays
+from nerf.geometry.space_maps import Box, MappedRays, Ndc, SpaceMap
 from nerf.kernels import BOX, Backend, BinaryOccupancy, GridLayout, RayStepping, Samples, grid_layout
-from nerf.kernels.torch.marching import unit_coordinates
 from nerf.kernels.torch.occupancy import binary_occupancy, cell_numbers, is_occupied
 from nerf.rendering.early_termination import EARLY_STOP_TRANSMITTANCE, MarchingRound, march_with_early_termination
 from nerf.runtime.profiler import WorkCounts, span
@@ -48,10 +48,10 @@ CORNERS = 8  # of a cell: rows that a point reads of each grid
 class HashGridSettings:
     """Sizes of a hash-grid field. Raises ValueError on impossible ones.
 
-    ``diagonal_steps``: steps along the diagonal of a bounded scene's box. ``min_step_size`` (scene units) and
-    ``cone_angle`` (step per distance) replace it where space is ``contracted``. Without ``view_dependence`` a point has
-    one colour. ``background_model``: a colour for each direction lies behind everything (nerf/fields/background.py),
-    whatever else is given as a background.
+    ``space``: how the scene fills the cube of the grids. ``diagonal_steps``: steps along that cube's diagonal.
+    ``min_step_size`` (scene units) and ``cone_angle`` (step per distance) replace it where space is contracted. Without
+    ``view_dependence`` a point has one colour. ``background_model``: a colour for each direction lies behind everything
+    (nerf/fields/background.py), whatever else is given as a background.
     """
 
     num_levels: int = 5
@@ -59,7 +59,7 @@ class HashGridSettings:
     log2_hashmap_size: int = 18
     base_res: int = 16
     max_res: int = 384
-    contracted: bool = False
+    space: SpaceMap = field(default_factory=Box)
     diagonal_steps: int = 384
     min_step_size: float = 0.002
     cone_angle: float = 0.008
@@ -100,7 +100,7 @@ class HashGridSettings:
     @property
     def stepping(self) -> RayStepping:
         """Of the samples."""
-        if self.contracted:
+        if self.space.bends_rays:
             return RayStepping(
                 self.min_step_size, self.cone_angle, True, self.occupancy_resolution, self.max_samples_per_ray
             )
@@ -109,12 +109,12 @@ class HashGridSettings:
 
     @property
     def render_stepping(self) -> RayStepping:
-        """Of the samples of rays that are rendered without training: RENDER_SAMPLE_RATIO times as many if contracted.
+        """Of the samples of rays that are rendered without training: RENDER_SAMPLE_RATIO times as many if unbounded.
 
         Training jitters samples that stand a few finest cells apart, so that over many steps it meets what lies between
         them; a rendering samples fixed places, once, and would show the gaps as shells. In a box samples are closer.
         """
-        stepping, closer = self.stepping, RENDER_SAMPLE_RATIO if self.contracted else 1
+        stepping, closer = self.stepping, RENDER_SAMPLE_RATIO if self.space.unbounded else 1
         return stepping._replace(
             step_size=stepping.step_size / closer,
             cone_angle=stepping.cone_angle / closer,
@@ -124,9 +124,11 @@ class HashGridSettings:
 
 class HashGridPass(NamedTuple):
     """What a rendering computed on its way, for :meth:`HashGridField.backward`; ``marched`` counts all densities asked,
-    ``thickness`` is of the samples' own intervals, not of what they stand for."""
+    ``thickness`` is of the samples' own intervals, not of what they stand for. ``samples`` stand at distances along
+    the ``mapped`` rays, for lengths in the scene."""
 
     rays: Rays
+    mapped: MappedRays
     background: Float[Tensor, "rays 3"]
     marched: int
     samples: Samples
@@ -168,7 +170,7 @@ class HashGridField(nn.Module):
 
     def __init__(self, settings: HashGridSettings, seed: int, backend: Backend) -> None:
         super().__init__()
-        self.settings, self.backend = settings, backend
+        self.settings, self.space, self.backend = settings, settings.space, backend
         self.layout, self.stepping, self.render_stepping = settings.layout, settings.stepping, settings.render_stepping
         random = generator("cpu", seed, 0)
         shape = (self.layout.rows, settings.features_per_level)
@@ -207,7 +209,7 @@ class HashGridField(nn.Module):
         self.empty_distance.copy_(binary_occupancy(bits).empty_distance)
 
     def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
-        """Density per scene unit; zero in cells that are not sampled, and outside the box of a bounded scene."""
+        """Density per scene unit; zero in cells that are not sampled, and outside the cube."""
         unit, sampled = self._located(points)
         sigma = unit.new_zeros(len(unit))
         sigma[sampled] = self.unit_density(unit[sampled])
@@ -229,12 +231,11 @@ class HashGridField(nn.Module):
         return torch.where(sampled, density.sigma, 0).view(points.shape[:-1]), colour.view(points.shape)
 
     def _located(self, points: Float[Tensor, "*points 3"]) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
-        """Unit coordinates of points, and which of them lie in cells that are sampled and in a bounded scene's box."""
-        unit = unit_coordinates(points, self.settings.contracted).reshape(-1, 3)
+        """Unit coordinates of points, and which of them lie in cells that are sampled."""
+        mapped, half = self.space.forward(points).reshape(-1, 3), self.space.half
+        unit = (mapped + half) / (2 * half)
         sampled = is_occupied(self.occupancy_bits, cell_numbers(self.settings.occupancy_resolution, unit))
-        if not self.settings.contracted:
-            sampled &= (points.reshape(-1, 3).abs() <= BOX).all(-1)
-        return unit, sampled
+        return unit, sampled & (mapped.abs() <= half).all(-1)
 
     @torch.no_grad()
     def render(self, rays: Rays, background: Float[Tensor, "3"]) -> Rendering:
@@ -248,8 +249,10 @@ class HashGridField(nn.Module):
         rendered, accumulated = rays.far.new_zeros(len(rays.far), 4), torch.zeros_like(rays.far)
         depth = torch.zeros_like(rays.far, dtype=torch.float64)
         of_rays = mlp.ray_hidden(self.weights, self.of_directions(rays.directions))
-        for samples, _, density in self._march(rays, torch.full_like(rays.near, 0.5), self.render_stepping):
+        mapped = self.space.map_rays(rays)
+        for samples, _, density in self._march(mapped, torch.full_like(rays.near, 0.5), self.render_stepping):
             with span("composite"):
+                samples = _in_scene(mapped, samples)
                 selected = backend.select_colour_samples(samples, density.sigma, OPACITY_STEP, depth, accumulated)
                 geometry = backend.gather_rows(density.geometry, selected.rows)
             colour = mlp.colour_of(self.weights, backend, selected.samples.ray, geometry, of_rays)
@@ -270,8 +273,8 @@ class HashGridField(nn.Module):
         """Density of all samples in occupied cells; colour of those that can be seen, thin ones standing for others
         like them (``Backend.visible_samples``, which ``offset`` is for)."""
         backend, rays = self.backend, rays.each(Tensor.contiguous)
-        background = self._behind(rays, background)
-        rounds = list(self._march(rays, jitter, self.stepping))
+        background, mapped = self._behind(rays, background), self.space.map_rays(rays)
+        rounds = list(self._march(mapped, jitter, self.stepping))
         with span("march"):
             marched, order = backend.pack_rounds([each.samples for each in rounds])
             sigma = torch.cat([each.density.sigma for each in rounds]).index_select(0, order)
@@ -289,9 +292,10 @@ class HashGridField(nn.Module):
             of_rays = mlp.ray_hidden(self.weights, harmonics)
         colour = mlp.colour_forward(self.weights, backend, samples, density.geometry, of_rays)
         with span("composite"):
-            rendering, weights = backend.composite(samples, density.sigma, colour.colour, background, rays.far)
+            of_scene = _in_scene(mapped, samples)
+            rendering, weights = backend.composite(of_scene, density.sigma, colour.colour, background, rays.far)
         of_samples = samples, points, thickness, density
-        return HashGridPass(rays, background, len(order), *of_samples, harmonics, colour, rendering, weights)
+        return HashGridPass(rays, mapped, background, len(order), *of_samples, harmonics, colour, rendering, weights)
 
     def backward(
         self, done: HashGridPass, grad: Rendering, grad_weights: Float[Tensor, "samples"]
@@ -299,7 +303,13 @@ class HashGridField(nn.Module):
         """Gradients of a loss, given those of the rendering and of the samples' weights."""
         backend, density, colour = self.backend, done.density, done.colour
         grad_sigma, grad_colour = backend.composite_backward(
-            done.samples, density.sigma, colour.colour, done.background, done.rays.far, grad, grad_weights
+            _in_scene(done.mapped, done.samples),
+            density.sigma,
+            colour.colour,
+            done.background,
+            done.rays.far,
+            grad,
+            grad_weights,
         )
         of_colour = mlp.colour_backward(self.weights, backend, done.samples, colour, done.harmonics, grad_colour)
         of_density = mlp.density_backward(self.weights, backend, density, grad_sigma, of_colour.geometry)
@@ -311,10 +321,13 @@ class HashGridField(nn.Module):
         self, done: HashGridPass, gradients: HashGridGradients
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
         """Gradients of the rays' origins and directions, for refining poses."""
-        backend, rays, samples = self.backend, done.rays, done.samples
+        backend, rays, samples = self.backend, done.rays, _in_scene(done.mapped, done.samples)
         grad_points = backend.encode_backward_points(self.layout, self.table, done.points, gradients.features)
+        if isinstance(self.space, Ndc):
+            points = rays.origins[samples.ray] + samples.t[:, None] * rays.directions[samples.ray]
+            grad_points = self.space.pull_back(points, grad_points)
         grad_origins, grad_directions = backend.sample_points_backward(
-            rays, samples, self.settings.contracted, grad_points
+            rays, samples, self.space.bends_rays, grad_points
         )
         grad_directions = grad_directions + self.of_directions_backward(rays.directions, gradients.harmonics)
         if self.settings.background_model:
@@ -334,7 +347,7 @@ class HashGridField(nn.Module):
             else background
         )
 
-    def _march(self, rays: Rays, jitter: Float[Tensor, "rays"], stepping: RayStepping) -> Iterator[MarchingRound]:
+    def _march(self, rays: MappedRays, jitter: Float[Tensor, "rays"], stepping: RayStepping) -> Iterator[MarchingRound]:
         return march_with_early_termination(
             self.backend,
             BinaryOccupancy(self.occupancy_bits, self.empty_distance),
@@ -348,3 +361,8 @@ class HashGridField(nn.Module):
         with span("gather", WorkCounts(gathered_rows=CORNERS * len(self.layout.resolutions) * len(unit))):
             features = self.backend.encode(self.layout, self.table, unit)
         return mlp.density_forward(self.weights, features)
+
+
+def _in_scene(mapped: MappedRays, samples: Samples) -> Samples:
+    """Marched samples at their distances in the scene."""
+    return samples._replace(t=mapped.to_scene(samples.t, samples.ray))

@@ -9,8 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf.fields.hash_grid import HashGridField
-from nerf.geometry.contraction import uncontract
-from nerf.kernels import CONTRACTED_BOX
+from nerf.geometry.space_maps import Ndc
 from nerf.kernels.torch.occupancy import BRICK_CELLS
 from nerf.runtime.parallel import in_order
 
@@ -73,16 +72,19 @@ class OccupancyGrid:
         return self.field.unit_density(unit) * self._step_length(unit)
 
     def _step_length(self, unit: Float[Tensor, "points 3"]) -> Float[Tensor, "points"] | float:
-        """The step size at points, as seen from a camera near the origin.
+        """The step size at points in scene units, as seen from a camera near the origin, or near the apex of normalised
+        device coordinates.
 
         The outermost cells reach to infinity; their points count as half a cell within.
         """
-        stepping = self.field.stepping
-        if not stepping.cone_angle:
+        stepping, space = self.field.stepping, self.field.space
+        if not space.unbounded:
             return stepping.step_size
         margin = 0.5 / stepping.occupancy_resolution
-        within = 2 * CONTRACTED_BOX * (unit.clamp(margin, 1 - margin) - 0.5)
-        return (stepping.cone_angle * uncontract(within).norm(dim=-1)).clamp(min=stepping.step_size)
+        within = 2 * space.half * (unit.clamp(margin, 1 - margin) - 0.5)
+        if isinstance(space, Ndc):
+            return stepping.step_size * space.scene_length(within)
+        return (stepping.cone_angle * space.inverse(within).norm(dim=-1)).clamp(min=stepping.step_size)
 
 
 def _blocks(field: HashGridField) -> tuple[Float[Tensor, "bricks blocks 3"], Int[Tensor, "cells"]]:

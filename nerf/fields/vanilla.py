@@ -6,13 +6,13 @@ Named deviations, each with its reason:
   answers below zero, and now and then a whole network starts, and stays, there;
 * each second-stage sample is drawn from its own share of the probability (nerf/rendering/sampling.py) and the last
   interval ends at far: no sample is wasted, no length is made up;
-* unbounded scenes are contracted (nerf/geometry/contraction.py) when ``contracted``; bounded ones are cut to the cube
-  of half size ``BOX``, because the encoding has period 2 and would repeat the scene beyond it; directions are scaled by
+* ``space`` says how the scene is encoded (nerf/geometry/space_maps.py); what is not contracted is cut to the cube of
+  half size ``BOX``, because the encoding has period 2 and would repeat the scene beyond it; directions are scaled by
   ``DIRECTION_SCALE`` before they are encoded, for the same reason.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 import torch
@@ -22,8 +22,8 @@ from torch.nn import functional
 
 from nerf.fields.interface import Rendering
 from nerf.fields.positional_encoding import positional_encoding
-from nerf.geometry.contraction import contract
 from nerf.geometry.rays import Rays, clip_to_box, points_on
+from nerf.geometry.space_maps import Box, MappedRays, Ndc, SpaceMap
 from nerf.rendering.sampling import Spacing, midpoint_edges, sample_pdf, stratified
 from nerf.rendering.volume_rendering import composite, volume_weights
 from nerf.runtime.profiler import WorkCounts, span
@@ -67,7 +67,7 @@ class VanillaSettings:
     view_dependence: bool = True
     positional_encoding: bool = True
     hierarchical: bool = True
-    contracted: bool = False
+    space: SpaceMap = field(default_factory=Box)
     spacing: Spacing = "linear"
     density_activation: Literal["softplus", "relu"] = "softplus"
 
@@ -80,6 +80,8 @@ class VanillaSettings:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at most {MAX_SIZE}")
         if self.spacing not in get_args(Spacing):
             raise ValueError(f"spacing is {self.spacing!r}; it must be 'linear' or 'log'")
+        if self.spacing == "log" and isinstance(self.space, Ndc):
+            raise ValueError("spacing is 'log'; in normalised device coordinates it must be 'linear'")
         if self.density_activation not in ("softplus", "relu"):
             raise ValueError(f"density_activation is {self.density_activation!r}; it must be 'softplus' or 'relu'")
 
@@ -160,56 +162,65 @@ class VanillaNerf(nn.Module):
 
     def __init__(self, settings: VanillaSettings, seed: int) -> None:
         super().__init__()
-        self.settings = settings
+        self.settings, self.space = settings, settings.space
         self.coarse = VanillaMlp(settings, generator("cpu", seed, 0)) if settings.hierarchical else None
         self.fine = VanillaMlp(settings, generator("cpu", seed, 1))
 
     def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Density per scene unit; zero outside the cube to which an uncontracted field is cut."""
-        return self._cut(points, self.fine.density(self._coordinates(points)))
+        mapped = self.space.forward(points)
+        return self._cut(mapped, self.fine.density(self._encoded(mapped)))
 
     def density_and_colour(
         self, points: Float[Tensor, "*points 3"], directions: Float[Tensor, "*points 3"]
     ) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points 3"]]:
         """What :meth:`density` says, and the colour seen by viewing rays of unit ``directions``."""
-        sigma, colour = self.fine(self._coordinates(points)[..., None, :], directions)
-        return self._cut(points, sigma[..., 0]), colour[..., 0, :]
+        mapped = self.space.forward(points)
+        sigma, colour = self.fine(self._encoded(mapped)[..., None, :], directions)
+        return self._cut(mapped, sigma[..., 0]), colour[..., 0, :]
 
     @torch.no_grad()
     def render(self, rays: Rays, background: Float[Tensor, "3"]) -> Rendering:
         """Render without randomness and without gradient; the coarse network answers for density only."""
-        rays = self._in_field(rays)
-        t = self._first_samples(rays, None)
+        mapped = self._in_field(rays)
+        t = self._first_samples(mapped.rays, None)
         if self.coarse is not None:
-            sigma = self.coarse.density(self._coordinates(points_on(rays, t[..., :-1])))
-            t = self._refined(rays, t, volume_weights(sigma, t)[0], None)
-        return self._seen(self.fine, rays, t, background)[0]
+            sigma = self.coarse.density(self._on_rays(mapped.rays, t[..., :-1]))
+            t = self._refined(mapped.rays, t, volume_weights(sigma, mapped.to_scene(t))[0], None)
+        return self._seen(self.fine, rays, mapped, t, background)[0]
 
     def render_training(
         self, rays: Rays, background: Float[Tensor, "*#rays 3"], generator: torch.Generator | None
     ) -> tuple[Rendering, Rendering]:
         """The coarse and the fine rendering, both differentiable; one and the same if not ``hierarchical``."""
-        rays = self._in_field(rays)
-        t = self._first_samples(rays, generator)
+        mapped = self._in_field(rays)
+        t = self._first_samples(mapped.rays, generator)
         if self.coarse is None:
-            only, _ = self._seen(self.fine, rays, t, background)
+            only, _ = self._seen(self.fine, rays, mapped, t, background)
             return only, only
-        coarse, weights = self._seen(self.coarse, rays, t, background)
-        fine, _ = self._seen(self.fine, rays, self._refined(rays, t, weights, generator), background)
+        coarse, weights = self._seen(self.coarse, rays, mapped, t, background)
+        t = self._refined(mapped.rays, t, weights, generator)
+        fine, _ = self._seen(self.fine, rays, mapped, t, background)
         return coarse, fine
 
-    def _in_field(self, rays: Rays) -> Rays:
+    def _in_field(self, rays: Rays) -> MappedRays:
         """In float64, as are the points and sums on the rays: 2⁹π, the highest frequency, takes the rounding of a
         float32 point to 1e-4. The networks compute in the type of their weights."""
         with span("sampling"):
-            exact = rays.each(Tensor.double)
-            return exact if self.settings.contracted else clip_to_box(exact, -BOX, BOX)
+            mapped = self.space.map_rays(rays.each(Tensor.double))
+            return mapped if self.space.bends_rays else mapped._replace(rays=clip_to_box(mapped.rays, -BOX, BOX))
 
-    def _cut(self, points: Float[Tensor, "*points 3"], sigma: Float[Tensor, "*points"]) -> Float[Tensor, "*points"]:
-        return sigma if self.settings.contracted else torch.where((points.abs() <= BOX).all(-1), sigma, 0)
+    def _cut(self, mapped: Float[Tensor, "*points 3"], sigma: Float[Tensor, "*points"]) -> Float[Tensor, "*points"]:
+        return sigma if self.space.bends_rays else torch.where((mapped.abs() <= BOX).all(-1), sigma, 0)
 
-    def _coordinates(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-        return CONTRACTED_SCALE * contract(points) if self.settings.contracted else points
+    def _encoded(self, mapped: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+        """What is encoded of mapped points: within (-1, 1)."""
+        return CONTRACTED_SCALE * mapped if self.space.bends_rays else mapped
+
+    def _on_rays(self, rays: Rays, t: Float[Tensor, "*rays n"]) -> Float[Tensor, "*rays n 3"]:
+        """What is encoded of points on mapped rays."""
+        points = points_on(rays, t)
+        return self._encoded(self.space.forward(points) if self.space.bends_rays else points)
 
     def _first_samples(self, rays: Rays, generator: torch.Generator | None) -> Float[Tensor, "*rays ends"]:
         settings = self.settings
@@ -230,13 +241,18 @@ class VanillaNerf(nn.Module):
             return torch.sort(torch.cat([t, drawn], -1)).values
 
     def _seen(
-        self, mlp: VanillaMlp, rays: Rays, t: Float[Tensor, "*rays ends"], background: Float[Tensor, "*#rays 3"]
+        self,
+        mlp: VanillaMlp,
+        rays: Rays,
+        mapped: MappedRays,
+        t: Float[Tensor, "*rays ends"],
+        background: Float[Tensor, "*#rays 3"],
     ) -> tuple[Rendering, Float[Tensor, "*rays ends-1"]]:
         with span("sampling"):
-            points = self._coordinates(points_on(rays, t[..., :-1]))
-        sigma, colour = mlp(points, rays.directions)
+            points = self._on_rays(mapped.rays, t[..., :-1])
+        sigma, colour = mlp(points, rays.directions.double())
         with span("composite"):
-            rendering, weights = composite(sigma, colour, t, background)
+            rendering, weights = composite(sigma, colour, mapped.to_scene(t), background)
             return Rendering(*(each.to(background.dtype) for each in rendering)), weights
 
 

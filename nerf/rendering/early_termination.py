@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.fields.mlp import DensityPass
-from nerf.geometry.rays import Rays
+from nerf.geometry.space_maps import MappedRays
 from nerf.kernels import Backend, BinaryOccupancy, RayStepping, Samples
 from nerf.runtime.profiler import span
 
@@ -37,15 +37,16 @@ def march_with_early_termination(
     occupancy: BinaryOccupancy,
     stepping: RayStepping,
     density_at: Callable[[Float[Tensor, "points 3"]], DensityPass],
-    rays: Rays,
+    mapped: MappedRays,
     jitter: Float[Tensor, "rays"],
 ) -> Iterator[MarchingRound]:
     """The samples of rays in occupied cells up to where their transmittance falls below EARLY_STOP_TRANSMITTANCE,
     ``stepping.max_samples`` per ray at most, in one round or more. There must be rays.
 
     Samples stand where :meth:`Backend.march` puts them: each round goes on where the last has ended. ``density_at``
-    takes points in unit coordinates.
+    takes points in unit coordinates. Samples have distances along the ``mapped`` rays and lengths in the scene.
     """
+    rays = mapped.rays
     active_rays, near = len(jitter), rays.near.clone()
     depth, taken = torch.zeros_like(jitter, dtype=torch.float64), 0
     while active_rays and taken < stepping.max_samples:
@@ -53,6 +54,7 @@ def march_with_early_termination(
         this_round = stepping._replace(max_samples=min(length, stepping.max_samples - taken))
         with span("march"):
             samples = backend.march(occupancy, this_round, rays._replace(near=near), jitter)
+            samples = samples._replace(dt=samples.dt * mapped.scene_length(samples.t, samples.ray))
             points = backend.sample_points(rays, samples, stepping.contracted)
         density = density_at(points)
         yield MarchingRound(samples, points, density)

@@ -1,7 +1,7 @@
 """One optimisation step of a hash-grid field, behind the same interface as the paper's (nerf/training/trainer.py)."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Literal, NamedTuple
 
@@ -60,7 +60,7 @@ class HashGridTrainerSettings:
     ``background`` is what lies behind a scene without a background model: a colour, or another random one for each ray
     (only for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight of the
     distortion loss, for scenes without a known background. ``depth_loss``: initial weight of the sparse depth loss, at
-    the pixels whose distance the dataset knows. ``least_photos``: that must see a cell of contracted space for
+    the pixels whose distance the dataset knows. ``least_photos``: that must see a cell of unbounded space for
     something to stand before their foregrounds (nerf/fields/frustum_mask.py), or all but one where they are few.
     """
 
@@ -146,7 +146,7 @@ class HashGridTrainer:
     ) -> None:
         self.model, self.settings, self.effects = model, settings, effects
         # Nothing beyond the box of a bounded scene is drawn: a point there would pull the light to its walls.
-        self.dataset = dataset if model.settings.contracted else dataset.with_sparse_depths_within(BOX)
+        self.dataset = dataset if model.space.unbounded else dataset.with_sparse_depths_within(BOX)
         self.occupancy_grid = OccupancyGrid(model, self._usable())
         of_networks = model.weights._asdict()
         self.background = {"background_table": model.background_table} if model.settings.background_model else {}
@@ -159,11 +159,11 @@ class HashGridTrainer:
         self.drawn = torch.tensor(0)  # pixels of that order so far; steps differ in how many they take
 
     def _usable(self) -> Bool[Tensor, "cells"] | None:
-        """Known only where points tell where foregrounds begin, in contracted space: a box is carved beforehand."""
-        least, stepping = min(self.settings.least_photos, len(self.dataset.near) - 1), self.model.stepping
-        if least <= 1 or self.dataset.known is None or not stepping.contracted:
+        """Known only where points tell where foregrounds begin, in unbounded space: a box is carved beforehand."""
+        least, space = min(self.settings.least_photos, len(self.dataset.near) - 1), self.model.space
+        if least <= 1 or self.dataset.known is None or not space.unbounded:
             return None
-        return compute_frustum_mask(self.dataset, least, stepping.occupancy_resolution)
+        return compute_frustum_mask(self.dataset, space, least, self.model.stepping.occupancy_resolution)
 
     def step(self, step: int, progress: float, lr_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
@@ -190,7 +190,7 @@ class HashGridTrainer:
             | {f"exp_avg_sq.{name}": tensor for name, tensor in self.exp_avg_sq.items()}
             | {"optical_thickness": self.occupancy_grid.optical_thickness}
             | {"samples_per_ray": self.samples_per_ray, "drawn": self.drawn}
-            | {"settings": torch.tensor(astuple(self.model.settings), dtype=torch.float64)}
+            | {"settings": torch.frombuffer(bytearray(repr(self.model.settings).encode()), dtype=torch.uint8)}
         )
 
     def load_state(self, state: dict[str, Tensor]) -> None:
@@ -273,11 +273,13 @@ class HashGridTrainer:
         backend, stepping = self.model.backend, self.model.stepping
         if self.settings.distortion:
             each = torch.full_like(batch.distance, self.settings.distortion * distortion_multiplier(progress) / rays)
-            value = value + (each * backend.distortion(done.samples, done.weights, stepping)).sum()
-            grad_weights = backend.distortion_backward(done.samples, done.weights, stepping, each)
+            lengths = done.samples.dt / done.mapped.scene_length(done.samples.t, done.samples.ray)
+            marched = done.samples._replace(dt=lengths)
+            value = value + (each * backend.distortion(marched, done.weights, stepping)).sum()
+            grad_weights = backend.distortion_backward(marched, done.weights, stepping, each)
         if self._has_depth_loss(progress):
             each = torch.full_like(batch.distance, self.settings.depth_loss * depth_loss_multiplier(progress) / rays)
-            places = done.rays.far, batch.distance, stepping
+            places = done.mapped.rays.far, done.mapped.from_scene(batch.distance), stepping
             apart = backend.depth_loss(done.samples, done.weights, done.rendering.opacity, *places)
             value = value + (each * apart).sum()
             of_weights, of_opacity = backend.depth_loss_backward(done.samples, *places, each)

@@ -1,4 +1,5 @@
-"""The optional effects. Options, statistics, A/B runs, training, records and the report follow from this list.
+"""The optional effects. Options, statistics, A/B runs, training, field.json, renders, scores and the report follow from
+this list.
 
 A new effect is its model in ``nerf/effects``, its statistic in ``nerf/effects/statistics`` and its entry here. The
 order is that in which effects are decided, and applied to rays and colours.
@@ -9,22 +10,20 @@ from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     import numpy as np
-    from torch import Tensor
 
-    from nerf.effects import ColourEffect, RayEffect, TrainingImages
+    from nerf.effects import ColourEffect, RayEffect
     from nerf.effects.statistics.statistic import Evidence
     from stages.effects.evidence import Observations
 
 
 class EffectParts(NamedTuple):
     """What an effect is made of. ``statistic`` tells whether the scene calls for it; ``measured``, what it begins with,
-    (training images, numbers). ``rays`` or ``colours`` makes its model, given the latter; neither: the field's own
-    settings model it (stages/train)."""
+    (training images, numbers). ``rays`` or ``colours`` is its model; neither: it is the field's own (stages/train)."""
 
     statistic: "Callable[[Observations], Evidence]"
     measured: "Callable[[Observations], np.ndarray] | None" = None
-    rays: "Callable[[TrainingImages, Tensor | None], RayEffect] | None" = None
-    colours: "Callable[[TrainingImages, Tensor | None], ColourEffect] | None" = None
+    rays: "type[RayEffect] | None" = None
+    colours: "type[ColourEffect] | None" = None
 
 
 class Effect(NamedTuple):
@@ -47,14 +46,14 @@ def _exposure() -> EffectParts:
     from nerf.effects.exposure import ExposureModel
     from stages.effects.evidence import exposure_statistic, measured_gains
 
-    return EffectParts(exposure_statistic, measured_gains, colours=ExposureModel.initial)
+    return EffectParts(exposure_statistic, measured_gains, colours=ExposureModel)
 
 
 def _pose_refinement() -> EffectParts:
     from nerf.effects.pose_refinement import PoseRefinement
     from stages.effects.evidence import pose_statistic
 
-    return EffectParts(lambda seen: pose_statistic(seen.places), rays=PoseRefinement.initial)
+    return EffectParts(lambda seen: pose_statistic(seen.places), rays=PoseRefinement)
 
 
 def _view_dependence() -> EffectParts:

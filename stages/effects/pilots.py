@@ -7,22 +7,29 @@ half of such a photo and judged on its right half.
 
 import time
 from statistics import mean, median
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
+import torch
+from torch import Tensor
+
+from nerf.effects.appearance import AppearanceModel
+from nerf.fields.hash_grid import HashGridField
+from nerf.geometry.rays import Rays
+from nerf.geometry.scene import Scene, View
+from nerf.rendering.images import render_image
+from nerf.training.ray_dataset import RayDataset
 from stages.contract import Inputs, Progress, StageError
-from stages.effects.decisions import Decisions, image_effects
-from stages.effects.effect_list import EFFECTS
+from stages.effects.decisions import Decisions
+from stages.effects.image_effects import image_effects, learnt_effects, photo_effects, refines_poses
+from stages.evaluate.half_images import enough, from_fitted_pose, right_half_psnr
 from stages.evaluate.image_metrics import MIN_FOR_INTERVAL, mean_interval
-from stages.train.config import BLACK
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from nerf.fields.hash_grid import HashGridField
-    from nerf.geometry.rays import Rays
-    from nerf.geometry.scene import Scene
-    from nerf.training.ray_dataset import RayDataset
-    from stages.train.config import Config as TrainConfig
+from stages.hardware.backend import chosen_backend
+from stages.hardware.device import compute_device, cores
+from stages.train.config import BLACK, Config
+from stages.train.data import ALL_MASKED, PhotoReader, guided_dataset, view_mask, view_rays
+from stages.train.fields import make_trainer, with_defaults
+from stages.train.planning import seconds_per_step
+from stages.train.validation_images import set_aside
 
 LONG_SIDE = 200  # pixels of the photos in a pilot
 MAX_KEPT = 4  # of the training photos, to judge by; with fewer than MIN_FOR_INTERVAL their own noise is not known
@@ -58,26 +65,29 @@ class Pilot(NamedTuple):
 class _Photo(NamedTuple):
     """A photo kept back: (height, width) rays, colours and which pixels count."""
 
-    rays: "Rays"
-    colours: "Tensor"
-    used: "Tensor | None"
+    view: View
+    rays: Rays
+    colours: Tensor
+    used: Tensor | None
 
 
 class PilotScene(NamedTuple):
     """What every pilot of a scene shares; make it with :func:`pilot_scene`."""
 
-    scene: "Scene"
-    dataset: "RayDataset"
-    kept: "tuple[_Photo, ...]"
+    scene: Scene
+    dataset: RayDataset
+    kept: tuple[_Photo, ...]
 
 
-def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScene | str:
+class _Trained(NamedTuple):
+    """A field on the CPU, and ``learnt``, what field.json would have of its effects."""
+
+    field: HashGridField
+    learnt: dict[str, Any]
+
+
+def pilot_scene(inputs: Inputs, scene: Scene, progress: Progress) -> PilotScene | str:
     """Small photos to train on and to judge by, both from the training photos; or why there can be no pilot."""
-    from stages.evaluate.half_images import enough
-    from stages.hardware.device import compute_device
-    from stages.train.data import ALL_MASKED, PhotoReader, guided_dataset, view_mask, view_rays
-    from stages.train.validation_images import set_aside
-
     split = set_aside(scene, MAX_KEPT, MIN_FOR_INTERVAL)
     if split is None:
         return "too few training photos"
@@ -94,6 +104,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     reader = PhotoReader(inputs["ingest"], split, downscale)
     photos = [
         _Photo(
+            view,
             view_rays(split, view, downscale),
             reader.pixels(view, BLACK),
             view_mask(inputs["ingest"], split, view, downscale),
@@ -109,16 +120,12 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
 def fits_poses(off: Decisions, on: Decisions) -> bool:
     """Whether a pilot of these two arms finds out where photos kept back were taken from: where neither refines poses,
     they are taken as right."""
-    refined = {effect.name for effect in EFFECTS if effect.load().rays}
-    return not refined.isdisjoint({*off.on, *on.on})
+    return refines_poses({*off.on, *on.on})
 
 
-def expected_seconds(scene: "Scene", steps: int) -> tuple[float, float]:
+def expected_seconds(scene: Scene, steps: int) -> tuple[float, float]:
     """What a pilot takes here: its trainings, by a few steps of a fresh field, and what goes on beside them; and what a
     pilot takes that fits poses, too."""
-    from stages.hardware.device import compute_device, cores
-    from stages.train.planning import seconds_per_step
-
     arm, device = Decisions({"view_dependence": {}} | ({} if scene.has_alpha else {"background": {}})), compute_device()
     per_step = seconds_per_step(_config(arm, steps, device), scene, arm, device)
     trainings = (1 + BESIDE_TRAINING) * 2 * SEEDS * steps * per_step
@@ -137,10 +144,10 @@ def run_pilot(trial: PilotScene, off: Decisions, on: Decisions, steps: int, seed
         for name in ("off", "on") if number % 2 else ("on", "off"):
             done = (2 * number + len(scores)) / (2 * SEEDS)
             progress.update(f"pilot training {2 * number + len(scores) + 1} of {2 * SEEDS}", done)
-            trained = time.perf_counter()
-            field = _trained(trial, arms[name], steps, seed + number)
-            seconds[name] += time.perf_counter() - trained
-            scores[name] = [_score(field, photo, poses, seed) for photo in trial.kept]
+            started = time.perf_counter()
+            trained = _trained(trial, arms[name], steps, seed + number)
+            seconds[name] += time.perf_counter() - started
+            scores[name] = [_score(trained, trial.scene, photo, poses, seed) for photo in trial.kept]
         gains.append([with_it - without for with_it, without in zip(scores["on"], scores["off"], strict=True)])
     return Pilot(mean(map(mean, gains)), _noise(gains), seconds["on"] / seconds["off"] - 1)
 
@@ -154,25 +161,19 @@ def _noise(gains: list[list[float]]) -> float:
     return max((high - low) / 2 for low, high in intervals)
 
 
-def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "HashGridField":
+def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> _Trained:
     """A hash-grid field after ``steps`` steps under the decisions of one arm."""
-    from nerf.fields.hash_grid import HashGridField
-    from stages.train.fields import make_trainer
-
-    effects = image_effects(arm, trial.scene.of_split("train"), trial.dataset)
+    views = trial.scene.of_split("train")
+    effects = image_effects(arm, views, trial.dataset)
     trainer = make_trainer(_config(arm, steps, trial.dataset.device.type), trial.scene, trial.dataset, seed, effects)
     for step in range(steps):
         trainer.step(step, step / steps, 1.0)
     assert isinstance(trainer.model, HashGridField)
-    return trainer.model.to("cpu")
+    return _Trained(trainer.model.to("cpu"), {"effects": learnt_effects(trainer.effects, views)})
 
 
-def _config(arm: Decisions, steps: int, device: str) -> "TrainConfig":
+def _config(arm: Decisions, steps: int, device: str) -> Config:
     """A small hash-grid field with what stage train would choose."""
-    from stages.hardware.backend import chosen_backend
-    from stages.train.config import Config
-    from stages.train.fields import with_defaults
-
     return with_defaults(
         Config(
             field="grid",
@@ -189,18 +190,14 @@ def _config(arm: Decisions, steps: int, device: str) -> "TrainConfig":
     )
 
 
-def _score(field: "HashGridField", photo: _Photo, poses: bool, seed: int) -> float:
+def _score(trained: _Trained, scene: Scene, photo: _Photo, poses: bool, seed: int) -> float:
     """PSNR (dB) on the right half of a photo whose exposure (and pose) is fitted on its left half."""
-    import torch
-
-    from nerf.rendering.images import render_image
-    from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
-
-    black = torch.zeros(3)
-    picture = render_image(field, photo.rays, black)
+    black, effects = torch.zeros(3), photo_effects(trained.learnt, scene, photo.view)
+    shown = AppearanceModel(trained.field, effects)
+    picture = render_image(shown, photo.rays, black)
     if poses:
-        rays = from_fitted_pose(field, photo.rays, picture, black, photo.colours, photo.used, seed)
-        picture = render_image(field, rays, black)
+        rays = from_fitted_pose(trained.field, photo.rays, picture, black, photo.colours, photo.used, effects, seed)
+        picture = render_image(shown, rays, black)
     _, fitted = right_half_psnr(picture, black, photo.colours, photo.used)
     assert fitted is not None, "pilot_scene keeps no photo that has too few pixels"
     return fitted

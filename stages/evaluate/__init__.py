@@ -5,7 +5,7 @@ PSNR is taken from the float picture in [0, 1], per photo; figures over all phot
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from stages.train.data import PhotoReader
 
 INPUTS = ("ingest", "normalise", "train")
-VERSION = 13
+VERSION = 14
 EXIT_CODE = 15
 RESUMES = False
 PUBLISHED = ("metrics.json", "renders", "errors")
@@ -160,6 +160,8 @@ def _tried_rays(scene: "Scene", side: int) -> "Rays":
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Render the test photos, compare, and write metrics.json, renders/ and errors/."""
+    from stages.effects.image_effects import held_out_words
+
     scene = read_scene(inputs["normalise"])
     config = plan(config, inputs, progress)
     examiner = _examiner(config, scene, inputs, folder, progress)
@@ -176,7 +178,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     images = examiner.score(scored, progress)
     metrics = _overall(images, len(test), examiner.downscale, notes)
     metrics["background"] = examiner.renderer.background.tolist()
-    metrics["exposure"] = "as the photos taken nearest by" if examiner.gains else None
+    metrics["appearance"] = held_out_words(examiner.field)
     metrics["poses_fitted"] = examiner.fits_poses
     write_json(folder / "metrics.json", metrics)
     facts = {key: metrics[key] for key in (*FIGURES, "verdict")}
@@ -186,14 +188,14 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 @dataclass(frozen=True)
 class Examiner:
     """Draws test views at 1/``downscale`` of the photos' size and compares them with what the camera saw, less what
-    masks ignore. ``gains`` are the exposures expected of photos by their names, where exposure is modelled;
-    ``fits_poses``: right halves have a third score, with the photo's pose fitted, too."""
+    masks ignore. ``field`` is the content of field.json; ``fits_poses``: right halves have a third score, with the
+    photo's pose fitted, too."""
 
     scene: "Scene"
     ingest: Path
     folder: Path
     renderer: "Renderer"
-    gains: "dict[str, Tensor]"
+    field: dict[str, Any]
     fits_poses: bool
     downscale: float
 
@@ -252,17 +254,17 @@ class Examiner:
 
     def _from_fitted_pose(self, view: "View", truth: "Tensor", used: "Tensor | None") -> "Rendering":
         """The view from where its left half says that it was taken."""
-        from nerf.effects.appearance import AppearanceModel
         from nerf.fields.hash_grid import HashGridField
+        from stages.effects.image_effects import photo_effects
         from stages.evaluate.half_images import from_fitted_pose
         from stages.train.data import view_rays
 
-        model = self.renderer.model
-        field = model.model if isinstance(model, AppearanceModel) else model
+        field = self.renderer.field
         assert isinstance(field, HashGridField), "only with a hash-grid field does evaluate fit poses"
         rays = view_rays(self.scene, view, self.downscale)
-        as_it_is = replace(self.renderer, model=field).draw(rays)
-        moved = from_fitted_pose(field.on_cpu(), rays, as_it_is, self.renderer.background.cpu(), truth, used)
+        rendering, effects = self._renderer(view).draw(rays), photo_effects(self.field, self.scene, view)
+        background = self.renderer.background.cpu()
+        moved = from_fitted_pose(field.on_cpu(), rays, rendering, background, truth, used, effects)
         return self._renderer(view).draw(moved)
 
     @cached_property
@@ -280,32 +282,34 @@ class Examiner:
         return view_mask(self.ingest, self.scene, view, self.downscale)
 
     def _renderer(self, view: "View") -> "Renderer":
-        return self.renderer.at_gain(self.gains[view.name]) if self.gains else self.renderer
+        from stages.effects.image_effects import photo_effects
+
+        return self.renderer.through(photo_effects(self.field, self.scene, view, self.renderer.device))
 
 
 def _examiner(config: Config, scene: "Scene", inputs: Inputs, folder: Path, progress: Progress) -> Examiner:
     """Load the field; data with alpha goes over the background asked for, the rest over what the field expects."""
-    from stages.effects.decisions import expected_gains
     from stages.render.renderer import load_renderer
 
     assert config.downscale is not None
     chosen = config.background if scene.has_alpha else None
     renderer = load_renderer(inputs["train"], BACKGROUNDS[chosen] if chosen else None, progress)
     field = read_json(inputs["train"] / "field.json")
-    gains = expected_gains(field, scene, scene.of_split("test"))
-    return Examiner(scene, inputs["ingest"], folder, renderer, gains, fits_poses(config, field), config.downscale)
+    return Examiner(scene, inputs["ingest"], folder, renderer, field, fits_poses(config, field), config.downscale)
 
 
 def fits_poses(config: Config, field: dict[str, Any]) -> bool:
     """Whether to score at fitted poses a field with this field.json. Raises StageError where it has no gradients for
     that."""
+    from stages.effects.image_effects import refines_poses
+
     fittable = field["kind"] == "grid"
     if config.fit_poses == "on" and not fittable:
         why = f"this is a {field['kind']} field, and only a hash-grid field tells the gradients of its rays"
         raise StageError(
             "evaluate.no-pose-fit", "cannot fit poses of test photos", why, "Give --evaluate.fit-poses auto."
         )
-    return fittable and (config.fit_poses == "on" or (config.fit_poses == "auto" and "poses" in field))
+    return fittable and (config.fit_poses == "on" or (config.fit_poses == "auto" and refines_poses(field["effects"])))
 
 
 def affordable(pixels: Sequence[int], budget: float) -> list[int]:

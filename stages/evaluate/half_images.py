@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from nerf.effects import ColourEffect
     from nerf.fields.hash_grid import HashGridField
     from nerf.fields.interface import Rendering
     from nerf.geometry.rays import Rays
@@ -46,10 +47,11 @@ def from_fitted_pose(
     background: "Tensor",
     truth: "Tensor",
     used: "Tensor | None",
+    effects: "tuple[ColourEffect, ...]" = (),
     seed: int = 0,
 ) -> "Rays":
     """``rays`` (H, W) of a photo from where its left half says that it was taken, at the exposure that suits the
-    ``rendering`` of ``field`` along them (at no other exposure than the field's own); everything on the CPU."""
+    ``rendering`` of ``field`` along them through the photo's ``effects``; everything on the CPU."""
     import torch
 
     from nerf.effects import ImageEffects
@@ -59,9 +61,9 @@ def from_fitted_pose(
 
     left, _ = halves(truth, used)
     _, log_gain = _exposed_as_left(rendering, background, truth, left)
-    exposure = ImageEffects(colours=(ExposureModel(log_gain[None]),))
+    shown = ImageEffects(colours=(*effects, ExposureModel(log_gain[None])))
     distance = viewing_distance(rendering, left)
-    pose = fit_pose(field, rays.each(lambda part: part[left]), truth[left], background, exposure, seed, distance)
+    pose = fit_pose(field, rays.each(lambda part: part[left]), truth[left], background, shown, seed, distance)
     flat = rays.each(lambda part: part.flatten(0, 1))
     moved = pose.forward(flat, torch.zeros(len(flat.near), dtype=torch.int64))
     return Rays(*(part.view_as(whole) for part, whole in zip(moved, rays, strict=True)))

@@ -1,29 +1,28 @@
 """A trained field on disk: ``field.safetensors`` (weights) and ``field.json`` (what they belong to)."""
 
 import json
-import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args
 
-import torch
 from pydantic import TypeAdapter, ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from nerf.effects.appearance import AppearanceModel
-from nerf.effects.exposure import ExposureModel
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.interface import RadianceModel
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
+from nerf.geometry.space_maps import space_map
 from stages.contract import Progress, StageError
+from stages.effects.image_effects import check_learnt_colours, new_view_effects
 from stages.hardware.backend import BackendName, backend_name, backend_of_field, load_backend
 from stages.io.files import first_fault, read_json, write_json
 
 
 def save_field(folder: Path, model: RadianceModel, info: dict[str, Any]) -> None:
-    """Write a field; ``info`` says what it was trained on: background, downscale, steps, rays. What computes a grid
-    field is written, too.
+    """Write a field; ``info`` says what it was trained on (background, downscale, steps, rays) and what its ``effects``
+    learnt. What computes a grid field is written, too.
 
     Raises:
         TypeError: for a kind of field that has no file format.
@@ -43,8 +42,8 @@ def load_field(
 ) -> tuple[RadianceModel, dict[str, Any]]:
     """The field in ``folder``, ready to render, and the content of its field.json.
 
-    One that models exposure comes at its reference exposure, in an AppearanceModel. ``progress`` is told why a grid
-    field is computed by torch's kernels: they trained it, or Warp's do not run on ``device``.
+    One with colour effects comes as new views show it, in an AppearanceModel. ``progress`` is told why a grid field is
+    computed by torch's kernels: they trained it, or Warp's do not run on ``device``.
 
     Raises:
         StageError: if the files are missing or damaged, or another version of the program wrote them.
@@ -54,7 +53,7 @@ def load_field(
         weights = folder / "field.safetensors"
         model = _untrained(info, weights.stat().st_size, device, progress)
         model.load_state_dict(load(weights.read_bytes()))  # load_file takes paths in Unicode alone
-        neutral = _neutral(info)
+        check_learnt_colours(info)
     except ValidationError as error:
         raise StageError(
             "io.field-settings", "cannot read the trained field", first_fault(error), "Run stage train again."
@@ -72,21 +71,8 @@ def load_field(
         why = " ".join(str(error).split())  # torch lists mismatches over several lines
         raise StageError("io.field-weights", "cannot read the trained field", why, "Run stage train again.") from error
     model = model.to(device).requires_grad_(False)
-    return model if neutral is None else _exposed(model, neutral, device), info
-
-
-def _neutral(info: dict[str, Any]) -> list[float] | None:
-    """The neutral log gains, None where exposure is not modelled. Raises ValueError for what are no gains."""
-    if info.get("exposure") is None:
-        return None
-    for name, log_gain in {"neutral": info["exposure"]["neutral"], **info["exposure"]["photos"]}.items():
-        if len(log_gain) != 3 or not all(math.isfinite(value) for value in log_gain):
-            raise ValueError(f"the exposure of {name} is {log_gain}; it must be three numbers")
-    return info["exposure"]["neutral"]
-
-
-def _exposed(model: RadianceModel, log_gain: list[float], device: str) -> RadianceModel:
-    return AppearanceModel(model, (ExposureModel(torch.tensor([log_gain], dtype=torch.float32, device=device)),))
+    effects = new_view_effects(info, device=device)
+    return AppearanceModel(model, effects) if effects else model, info
 
 
 def _untrained(
@@ -97,14 +83,14 @@ def _untrained(
     kind, settings = info["kind"], info["settings"]
     if kind not in ("grid", "paper"):
         raise ValueError(f"a field of kind {kind!r} is unknown to this version")
-    text = json.dumps(settings)
+    text, named = json.dumps(settings), settings | {"space": space_map(**settings["space"])}
     if kind == "grid":
-        grid = HashGridSettings(**settings)  # which refuses unknown names; their types are checked next
-        TypeAdapter(HashGridSettings).validate_json(text, strict=True)
+        HashGridSettings(**named)  # which refuses unknown names; their types are checked next
+        grid = TypeAdapter(HashGridSettings).validate_json(text, strict=True)
         _check_size(grid.layout.rows * grid.features_per_level, stored)
         return HashGridField(grid, 0, load_backend(backend_of_field(_trained_with(info), device, progress), device))
-    paper = VanillaSettings(**settings)
-    TypeAdapter(VanillaSettings).validate_json(text, strict=True)
+    VanillaSettings(**named)
+    paper = TypeAdapter(VanillaSettings).validate_json(text, strict=True)
     _check_size(paper.depth * paper.width**2, stored)
     return VanillaNerf(paper, seed=0)
 

@@ -71,7 +71,7 @@ class Rejection:
 def write_photos(
     folder: Path, photos: Sequence[Photo], rejected: Sequence[Rejection], frames: Mapping[str, str]
 ) -> None:
-    """Write photos.json. ``frames`` maps each file_path of the given cameras to the name of its photo."""
+    """Write photos.json. ``frames`` maps each file_path of the imported poses to the name of its photo."""
     content = {"photos": [asdict(p) for p in photos], "rejected": [asdict(r) for r in rejected], "frames": dict(frames)}
     write_json(folder / "photos.json", content)
 

@@ -14,7 +14,7 @@ from stages.contract import Flexible, Inputs, Progress, StageConfig, StageResult
 from stages.train import trained_seconds
 
 INPUTS = ("ingest", "normalise", "train")
-VERSION = 12
+VERSION = 13
 EXIT_CODE = 17
 RESUMES = False
 PUBLISHED = ("mesh.glb", "mesh.ply", "mesh.obj")

@@ -12,7 +12,7 @@ from nerf.fields.interface import RadianceModel
 from nerf.geometry.scene import Scene
 from nerf.rendering.volume_rendering import composite
 from stages.contract import Inputs, Progress, StageResult
-from stages.effects.decisions import neutral_in_words
+from stages.effects.image_effects import new_view_words
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_bytes, check_memory
 from stages.io.field_files import load_field
@@ -147,9 +147,9 @@ def save(config: "Config", extracted: Extracted, source: Source, folder: Path) -
     line = f"{count}, {components} component{'s' * (components > 1)}, {extracted.boundary}"
     if not extracted.iso_level.well_defined:
         line += "; the field has no clear surface yet, train for longer"
-    exposure = neutral_in_words(source.info)
-    line += "" if exposure is None else f" · {exposure}"
-    facts = _facts(config, extracted, source.scene) | ({} if exposure is None else {"exposure": exposure})
+    appearance = new_view_words(source.info)
+    line += "" if appearance is None else f" · {appearance}"
+    facts = _facts(config, extracted, source.scene) | ({} if appearance is None else {"appearance": appearance})
     return StageResult(outputs, line, facts=facts)
 
 

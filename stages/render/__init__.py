@@ -11,7 +11,7 @@ from stages.render.plan import MIN_WIDTH, PathKind, even_width
 from stages.train import trained_seconds
 
 INPUTS = ("normalise", "train")
-VERSION = 13
+VERSION = 14
 EXIT_CODE = 16
 RESUMES = False
 PUBLISHED = ("video.mp4", "depth.mp4", "path.json")
@@ -44,7 +44,7 @@ class Config(StageConfig):
     depth: bool = Field(default=True, description="write depth.mp4 too")
     match_exposure: str | None = Field(
         default=None,
-        description="name of a photo to render as it was exposed, where photos differ; none: neutral",
+        description="name of a photo to render as it was exposed, where photos differ; none: the reference exposure",
     )
     save_frames: bool = Field(default=False, description="keep every frame as PNG in frames/")
 
@@ -85,8 +85,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     assert config.width is not None and config.fps is not None
     scene = read_scene(inputs["normalise"])
     renderer = load_renderer(inputs["train"], progress=progress)
-    gain, exposure = video.exposure(config.match_exposure, inputs["train"], scene, progress)
-    renderer = renderer if gain is None else renderer.at_gain(gain)
+    renderer, appearance = video.as_asked(renderer, config.match_exposure, inputs["train"], scene, progress)
     path = video.camera_path(config, scene).resized(config.width)
     video.check_frame_memory(path)
     write_json(folder / "path.json", video.path_json(path, scene, config.fps))
@@ -95,7 +94,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     outputs = ("path.json", *video.write_videos(renderings, path, config, folder))
     frames_per_second = len(path.cameras) / (time.perf_counter() - started)
     write_json(folder / "speed.json", {"frames_per_second": frames_per_second})
-    facts = video.facts(config, path) | ({} if exposure is None else {"exposure": exposure})
+    facts = video.facts(config, path) | ({} if appearance is None else {"appearance": appearance})
     line = f"{facts['path']}, {facts['frames']} frames {facts['width']}×{facts['height']}"
-    line += "" if exposure is None else f" · {exposure}"
+    line += "" if appearance is None else f" · {appearance}"
     return StageResult(outputs, f"{line} · drawn at {frames_per_second:.2g} frames/s", ("speed.json",), facts)

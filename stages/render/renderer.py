@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from nerf.effects import ColourEffect
 from nerf.effects.appearance import AppearanceModel
-from nerf.effects.exposure import ExposureModel
 from nerf.fields.interface import RadianceModel, Rendering
 from nerf.geometry.rays import Rays
 from nerf.rendering.images import render_image
@@ -34,11 +34,19 @@ class Renderer:
     model: RadianceModel
     background: Tensor  # (3,), on the model's device
 
-    def at_gain(self, log_gain: Tensor) -> "Renderer":
-        """This field at another gain than the neutral one; only for a field that models exposure."""
-        assert isinstance(self.model, AppearanceModel)
-        effects = (ExposureModel(log_gain[None].to(self.background.device)),)
-        return replace(self, model=AppearanceModel(self.model.model, effects))
+    @property
+    def device(self) -> str:
+        """Where it is computed."""
+        return str(self.background.device)
+
+    @property
+    def field(self) -> RadianceModel:
+        """The field without effects."""
+        return self.model.model if isinstance(self.model, AppearanceModel) else self.model
+
+    def through(self, effects: tuple[ColourEffect, ...]) -> "Renderer":
+        """The field through these effects, on its device, in place of those of new views."""
+        return replace(self, model=AppearanceModel(self.field, effects) if effects else self.field)
 
     def draw(self, rays: Rays, on_chunk: Callable[[float], None] | None = None) -> Rendering:
         """The picture (height, width) that ``rays`` see, on the CPU. ``on_chunk`` is told the finished share."""
@@ -66,8 +74,8 @@ def load_renderer(
     train: Path, background: tuple[float, ...] | None = None, progress: Progress | None = None
 ) -> Renderer:
     """The field that stage train left in ``train``, over ``background``, which a field with a sky does not show; None:
-    what it was trained to stand before. One that models exposure is shown at its neutral one. ``progress`` is told
-    where the field is computed by torch's kernels alone."""
+    what it was trained to stand before. Colour effects are those of new views. ``progress`` is told where the field is
+    computed by torch's kernels alone."""
     device = compute_device()
     model, info = load_field(train, device, progress)
     return Renderer(model, torch.tensor(info["background"] if background is None else background, device=device))

@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-import torch
-from torch import Tensor
 
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays, join_rays
 from nerf.geometry.scene import Scene
 from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageError
-from stages.effects.decisions import expected_gains, neutral_in_words
+from stages.effects.image_effects import new_view_like, new_view_words, photo_effects
 from stages.hardware.memory import check_memory
 from stages.io.files import read_json, read_scene, write_png
 from stages.io.photos import spread
@@ -188,28 +186,31 @@ def path_json(path: CameraPath, scene: Scene, fps: int) -> dict[str, Any]:
     return (intrinsics(path.cameras[0]) if shared else {}) | {"fps": fps, "frames": frames}
 
 
-def exposure(photo: str | None, train: Path, scene: Scene, progress: Progress) -> tuple[Tensor | None, str | None]:
-    """The log gain (3,) of the video, None as the field comes, and this in words, None where the field has only one.
+def as_asked(
+    renderer: Renderer, photo: str | None, train: Path, scene: Scene, progress: Progress
+) -> tuple[Renderer, str | None]:
+    """What renders the video, and what it shows of the photos' effects; None where there are none.
 
-    Training is over when this is found out: a photo of which no exposure is known is no error, but what is taken
-    instead is said.
+    Training is over when this is found out: a photo of which nothing is known is no error, but what is taken instead is
+    said.
     """
     field = read_json(train / "field.json")
-    neutral = neutral_in_words(field)
-    if (known := field.get("exposure")) is None:
-        if photo is not None:
-            progress.note(f"exposure is not modelled: all photos count as exposed alike, and the video like {photo}")
-        return None, None
+    words = new_view_words(field)
     if photo is None:
-        return None, neutral
-    if photo in known["photos"]:
-        return torch.tensor(known["photos"][photo]), f"exposed like {photo}"
-    if unseen := [view for view in scene.views if view.name == photo]:
-        progress.note(f"{photo} was not trained on: its exposure is what the photos taken nearest by let expect")
-        return expected_gains(field, scene, unseen)[photo], f"exposed as expected of {photo}"
-    near = difflib.get_close_matches(photo, known["photos"], n=3)
-    progress.note(f"no photo {photo} has a camera: {neutral}" + (f"; perhaps {', '.join(near)}" if near else ""))
-    return None, neutral
+        return renderer, words
+    if renderer.model is renderer.field:
+        progress.note(f"exposure is not modelled: all photos count as exposed alike, and the video like {photo}")
+        return renderer, words
+    view = next((view for view in scene.views if view.name == photo), None)
+    if view is None:
+        near = difflib.get_close_matches(photo, [view.name for view in scene.views], n=3)
+        progress.note(f"no photo {photo} has a camera: {words}" + (f"; perhaps {', '.join(near)}" if near else ""))
+        return renderer, words
+    as_photo = renderer.through(new_view_like(photo_effects(field, scene, view, renderer.device)))
+    if any(photo in rows for rows in field["effects"].values()):
+        return as_photo, f"exposed like {photo}"
+    progress.note(f"{photo} was not trained on: its exposure is what the photos taken nearest by let expect")
+    return as_photo, f"exposed as expected of {photo}"
 
 
 def facts(config: "Config", path: CameraPath) -> dict[str, Any]:

@@ -5,6 +5,9 @@ from typing import Any, NamedTuple, TypeGuard
 
 MAX_DOUBTFUL = 0.05  # fraction of the photos that are excluded, differ from global mapping, or are weakly linked
 MIN_AGREEING = 0.5  # share of the verified pairs
+MIN_GLOBAL_SUPPORT = (
+    0.9  # verified pairs that agree with global mapping where it differs, of those that agree with ours
+)
 MAX_SHOWN = 8  # photos of a group
 MIN_SHOWN = 0.0001  # share of the extent: 0.00% would be no figure
 MAX_WEAK = 4  # weakly linked groups shown one by one
@@ -103,9 +106,18 @@ def _doubts_of_global_mapping(comparison: Mapping[str, Any] | None) -> list[str]
 
 
 def _disagrees(comparison: Mapping[str, Any] | None) -> TypeGuard[Mapping[str, Any]]:
+    return _differs(comparison) and not _is_refuted(comparison)
+
+
+def _differs(comparison: Mapping[str, Any] | None) -> TypeGuard[Mapping[str, Any]]:
     if not comparison or comparison["failed"]:
         return False
     return len(comparison["different"]) > MAX_DOUBTFUL * comparison["photos"]
+
+
+def _is_refuted(comparison: Mapping[str, Any]) -> bool:
+    """Whether clearly more verified pairs of the photos in question agree with the cameras than with global mapping."""
+    return comparison["agreeing_global"] < MIN_GLOBAL_SUPPORT * comparison["agreeing"]
 
 
 def _doubts_of_structure(repeated: Mapping[str, Any] | None) -> list[str]:
@@ -138,7 +150,10 @@ def _figures(registration: Mapping[str, Any]) -> str | None:
     if check and check["pairs"]:
         pairs = f"{check['agreeing']:,} of {check['pairs']:,} verified image pairs"
         said.append(f"the cameras agree with {pairs} (median error {check['error_px']:.2f} px)")
-    if comparison and not comparison["failed"] and comparison["centre"] is not None:
+    if _differs(comparison) and _is_refuted(comparison):
+        support = f"{comparison['agreeing_global']:,} verified image pairs agree with it and {comparison['agreeing']:,}"
+        said.append(f"global mapping gives {_photos(len(comparison['different']))} other poses; {support} with these")
+    elif comparison and not comparison["failed"] and comparison["centre"] is not None:
         same = f"{comparison['agree']} of {comparison['photos']} photos the same pose"
         extent = f"{max(comparison['centre'], MIN_SHOWN):.2%} of the extent"
         said.append(f"global mapping gives {same} (within {extent})")

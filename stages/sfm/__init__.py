@@ -15,10 +15,10 @@ from stages.contract import (
     Workload,
 )
 from stages.io.files import write_json
-from stages.sfm.pairs import Matcher
+from stages.sfm.pairs import MAX_EXHAUSTIVE, Matcher
 
 INPUTS = ("ingest",)
-VERSION = 16
+VERSION = 17
 EXIT_CODE = 11
 RESUMES = True
 PUBLISHED = ("sparse", "registration.json")
@@ -31,6 +31,7 @@ CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "O
 Direction = Literal["world-from-camera", "camera-from-world"]
 CameraAxes = Literal["opencv", "opengl"]
 MAX_STRATEGIES = 8  # the default of ``max_strategies``, which is all of them
+MAX_DOUBLED_MEGAPIXELS = 0.7  # photos of a longer side of up to 1024 pixels are doubled for feature extraction
 BUDGET_SHARE = 0.5  # of a budget: what it may take before it extracts fewer features
 
 
@@ -43,13 +44,13 @@ class Config(StageConfig):
     )
     pose_direction: Direction | None = Field(
         default=None,
-        description="What the matrices of known cameras are (default: world-from-camera in transforms files, "
+        description="What the matrices of imported poses are (default: world-from-camera in transforms files, "
         "camera-from-world in COLMAP models).",
     )
     camera_axes: CameraAxes | None = Field(
         default=None,
-        description="Where the axes of known cameras point: opencv (x right, y down, z forward) or opengl (x right, "
-        "y up, z back) (default: opengl in transforms files, opencv in COLMAP models).",
+        description="Where the camera axes of imported poses point: opencv (x right, y down, z forward) or opengl "
+        "(x right, y up, z back) (default: opengl in transforms files, opencv in COLMAP models).",
     )
     seed: int = Field(
         default=0,
@@ -106,17 +107,21 @@ class Config(StageConfig):
 
 
 def expected_seconds(config: Config, workload: Workload) -> float:
-    """Reading, features of each photo, matches of each pair or of 30 partners each, and mapping, which has one core.
+    """Reading, features of each photo, matches of each pair, and mapping and adjusting, which have one core.
 
-    Measured on two cores, on fox, fountain_p11, fern, banana, herzjesu_p8 and the demo: it took 0.6 to 1.8 times as
-    long, and longer where images were not registered at once.
+    Measured on two cores. Of up to MAX_EXHAUSTIVE photos it took 0.6 to 1.8 times as long (fox, fountain_p11, fern,
+    banana, herzjesu_p8, the demo), and longer where images were not registered at once; of 120 (bonsai_120) as long.
     """
-    if config.cameras is not None:
-        return 0.2
     photos, cores = workload.photos, workload.cores
-    pairs = photos.number * min(photos.number - 1, 60) / 2
-    features = 0.25 * photos.number * min(photos.megapixels, 1.7)
-    return 4.0 + photos.reading_seconds(cores) + (features + 0.02 * pairs) * 2 / cores + 0.4 * photos.number
+    if config.cameras is not None:
+        return 2.0 + 0.15 * photos.number / cores
+    chosen = photos.number > MAX_EXHAUSTIVE and config.matcher != "exhaustive"
+    pairs = 16.5 * photos.number if chosen else photos.number * (photos.number - 1) / 2
+    doubled = 4 if photos.megapixels < MAX_DOUBLED_MEGAPIXELS else 1
+    features = 0.25 * photos.number * min(doubled * photos.megapixels, 1.7)
+    matching = (0.04 if chosen else 0.02) * pairs
+    mapping = (0.8 if chosen else 0.4) * photos.number
+    return 4.0 + photos.reading_seconds(cores) + (features + matching) * 2 / cores + mapping
 
 
 def budget_seconds(left: BudgetLeft) -> float:

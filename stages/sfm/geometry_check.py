@@ -59,7 +59,8 @@ def transfer_errors_px(
     trusted: Bool[np.ndarray, "pairs"] | None = None,
 ) -> tuple[Float[np.ndarray, "2*matches"], Bool[np.ndarray, "2*matches"]]:
     """How far each match is from where the poses predict it, in pixels of the photo that sees it; the matches from
-    first to second photo, then those from second to first. Depths come from ``trusted`` pairs, from all without it.
+    first to second photo, then those from second to first. Depths come from ``trusted`` pairs, without it from all of
+    MIN_PAIR_MATCHES and more: chance matches tell no depth.
 
     Also which of them are predicted to a point, by a depth that others tell.
 
@@ -84,8 +85,8 @@ def transfer_errors_px(
     meets = scale > 0
     inverse_depth = np.maximum(np.divide(seen_sideways, scale, out=np.zeros_like(base), where=meets), 0)
     evidence = np.where(meets, _sensitivity(inverse_depth, base, ahead)[1], 0.0) ** 2
-    if trusted is not None:
-        evidence *= np.tile(trusted[matches.pair], 2)
+    sure = matches.weight >= MIN_PAIR_MATCHES if trusted is None else trusted
+    evidence *= np.tile(sure[matches.pair], 2)
     others, weight = _median_of_others(inverse_depth, evidence, source)
     known = weight > 0
     others = np.where(known, others, inverse_depth)
@@ -169,35 +170,43 @@ def check_poses(matches: PairMatches, world_from_camera: Float[np.ndarray, "phot
     The groups are the sides of weak cuts of the graph of agreeing pairs: a group that was moved as a whole agrees
     within, and hardly across. A group is misplaced if more matches across contradict than agree.
     """
-    count = len(world_from_camera)
-    error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera))
+    count, nowhere = len(world_from_camera), np.zeros(len(matches.pairs), bool)
+    error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, nowhere))
+    misplaced = _misplaced(*_votes(matches, error, _tolerance_px(error, matches.weight)[1], count))
+    error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, _trusted(matches, misplaced)))
     median, tolerance = _tolerance_px(error, matches.weight)
     support, against = _votes(matches, error, tolerance, count)
     misplaced = _misplaced(support, against)
     # Depths that a misplaced group got wrong count against good photos beside it: these are checked again without.
     for _ in range(MAX_RECHECKS if misplaced.any() else 0):
-        trusted = ~misplaced[matches.pairs].any(axis=1)
-        error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, trusted))
+        error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, _trusted(matches, misplaced)))
         support, against = _votes(matches, error, tolerance, count)
         cleared = misplaced & ((support - against)[:, ~misplaced].sum(axis=1) > 0)
         if not cleared.any():
             break
         misplaced &= ~cleared
+    agrees, contradicts = error <= tolerance, _contradicts(matches, error, tolerance)
     linked = _matrix(matches, error <= CONTRADICTION_FACTOR * tolerance, count)
     unlinked = ~misplaced & (connected(np.where(misplaced[:, None] | misplaced[None], 0, linked) > 0) > 0)
     passed = ~(misplaced | unlinked)
+    counted = passed[matches.pairs].all(axis=1) & (agrees | (matches.weight >= MIN_PAIR_MATCHES))
     return PoseCheck(
         pair_error_px=error,
-        photo_error_px=_photo_medians(matches, np.where(passed[matches.pairs].all(axis=1), error, np.nan), count),
+        photo_error_px=_photo_medians(matches, np.where(counted, error, np.nan), count),
         median_px=median,
         tolerance_px=tolerance,
-        agrees=error <= tolerance,
-        contradicts=_contradicts(matches, error, tolerance),
+        agrees=agrees,
+        contradicts=contradicts,
         misplaced=misplaced,
         unlinked=unlinked,
         votes_for=support[:, passed].sum(axis=1),
         votes_against=against[:, passed].sum(axis=1),
     )
+
+
+def _trusted(matches: PairMatches, misplaced: Bool[np.ndarray, "photos"]) -> Bool[np.ndarray, "pairs"]:
+    """The pairs that may tell depths: enough matches not to be chance, of photos that are not misplaced."""
+    return ~misplaced[matches.pairs].any(axis=1) & (matches.weight >= MIN_PAIR_MATCHES)
 
 
 def agreement(matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"]) -> tuple[int, int]:

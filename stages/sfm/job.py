@@ -15,9 +15,9 @@ from typing import Any
 from stages.io.files import write_durably
 from stages.io.photos import Photo
 from stages.sfm.colmap.database import Features, image_similarity, keep_open, read_vocabulary
-from stages.sfm.pairs import Matcher
+from stages.sfm.pairs import MAX_EXHAUSTIVE, Matcher
 from stages.sfm.pairs.image_retrieval import CELLS
-from stages.sfm.pairs.pair_selection import MAX_EXHAUSTIVE, SimilarityMatrix
+from stages.sfm.pairs.pair_selection import SimilarityMatrix
 from stages.sfm.registration import MIN_MODEL_POINTS, MIN_REGISTERED
 from stages.sfm.retry_strategies import MAX_SECONDS_LIMIT, STRATEGIES, TIME_GIVEN, Outcome, StrategyLog, read_kept
 

@@ -11,6 +11,7 @@ from stages.sfm.colmap.mapping import incremental_options, map_globally, map_inc
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import (
     Checked,
+    agreeing_pairs,
     check_model,
     copy_consistent_matches,
     deregister,
@@ -66,9 +67,17 @@ def run_mapping(
         checked = _checked(before, other, database, matches, options, state)
         found[0] = checked.model
         if other is not None:  # where it was taken itself, it is compared with the one that it replaced
-            compared = compare_models(before if found[0] is other else found[0], other) | {"failed": None}
+            compared = _comparison(before if found[0] is other else found[0], other, database, state)
     state.end("mapping")
     return found, checked, compared
+
+
+def _comparison(model: Any, other: Any, database: Path, state: JobState) -> dict[str, Any]:
+    """How the model of global mapping compares, and where it differs, how many verified pairs agree with either."""
+    compared = compare_models(model, other)
+    files, seed = set[str](compared["different"]), state.job.seed
+    support = [agreeing_pairs(one, database, seed, files) if files else None for one in (model, other)]
+    return compared | {"failed": None, "agreeing": support[0], "agreeing_global": support[1]}
 
 
 def _start_global_mapping(strategy: Strategy, database: Path, state: JobState) -> "global_mapping.Started | None":

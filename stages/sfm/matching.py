@@ -76,13 +76,13 @@ def match_photos(strategy: Strategy, missing: list[int], state: JobState) -> tup
     return database, graph
 
 
-def _extract(database: Path, search: ExtractionOptions, state: JobState) -> None:
+def _extract(database: Path, extraction: ExtractionOptions, state: JobState) -> None:
     state.begin("features", database=str(database))
     fill_database(database, state.photos, state.job.camera_model or MAPPING_MODEL, state.job.camera_params)
     masks = Path(state.job.folder, "masks")
     if write_feature_masks(state.images.parent, state.photos, masks):
-        search = search._replace(masks=masks)
-    extract_features(database, state.images, state.photos, search)
+        extraction = extraction._replace(masks=masks)
+    extract_features(database, state.images, state.photos, extraction)
     shutil.rmtree(masks, ignore_errors=True)
     state.end("features")
 
@@ -92,13 +92,13 @@ def _match_all(database: Path, state: JobState) -> dict[str, Any] | None:
 
     Returns how many pairs were tried and verified, and whether the order of names or times helped to choose them.
     """
-    job, count, places = state.job, len(state.photos), capture_priors(state.photos)
+    job, count, priors = state.job, len(state.photos), capture_priors(state.photos)
     if job.matcher == "exhaustive":
         _match(database, exhaustive(count), STRICT_RATIO, state)
         return None
     orders = candidate_orders(state.photos)
     pairs = union(
-        start_pairs(job.matcher, job.neighbours, count, places, lambda: state.similarity),
+        start_pairs(job.matcher, job.neighbours, count, priors, lambda: state.similarity),
         *(pairs_apart(order, 1, 2) for order in orders),
     )
 

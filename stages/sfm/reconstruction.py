@@ -19,7 +19,7 @@ from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.conventions import PoseConvention
 from stages.sfm.imported.import_poses import import_poses
 from stages.sfm.pairs.pair_selection import capture_priors
-from stages.sfm.pairs.quality_level import Open, check_matcher, chosen
+from stages.sfm.pairs.quality_level import GivenOptions, check_matcher, chosen
 from stages.sfm.registration import (
     MIN_MODEL_POINTS,
     MIN_REGISTERED,
@@ -54,9 +54,9 @@ if TYPE_CHECKING:
 
 def choose_options(config: "Config", ingest: Path, progress: Progress) -> "Config":
     """The config with features and pairs chosen, by what they take on this machine for some of the photos."""
-    left_open = Open(config.max_image_size, config.max_features, config.matcher)
+    given = GivenOptions(config.max_image_size, config.max_features, config.matcher)
     _, photos = _photos(ingest)
-    answer = chosen(left_open, photos, ingest / "images", config.neighbours, progress, config.seconds)
+    answer = chosen(given, photos, ingest / "images", config.neighbours, progress, config.seconds)
     return config.model_copy(update=answer._asdict())
 
 

@@ -25,7 +25,7 @@ from nerf.geometry.scene import Scene, View
 from nerf.training.metrics import psnr
 from stages import train
 from stages.contract import Inputs, Progress, StageError
-from stages.effects.decisions import expected_gains
+from stages.effects.image_effects import photo_effects
 from stages.evaluate.image_metrics import ssim
 from stages.io.files import read_json, sync_file, write_json_durably, write_png
 from stages.io.photos import spread
@@ -221,14 +221,14 @@ def render_photos(field: Path, benchmark: Benchmark) -> list[Tensor]:
 
 
 def _renderer(field: Path, benchmark: Benchmark) -> Callable[[Crop], Tensor]:
-    """What renders a crop by the field in a folder, in [0, 1], over the benchmark's background, at the exposure
-    expected of its photo."""
-    renderer = load_renderer(field, benchmark.background)
-    gains = expected_gains(read_json(field / "field.json"), benchmark.scene, benchmark.scene.of_split("test"))
+    """What renders a crop by the field in a folder, in [0, 1], over the benchmark's background, as its photo is
+    expected to show it."""
+    renderer, info = load_renderer(field, benchmark.background), read_json(field / "field.json")
+    views = {view.name: view for view in benchmark.scene.of_split("test")}
 
     def render(crop: Crop) -> Tensor:
-        exposed = renderer.at_gain(gains[crop.photo]) if gains else renderer
-        return exposed.draw(crop.rays).colour.clamp(0, 1)
+        effects = photo_effects(info, benchmark.scene, views[crop.photo], renderer.device)
+        return renderer.through(effects).draw(crop.rays).colour.clamp(0, 1)
 
     return render
 

@@ -13,7 +13,8 @@ from nerf.runtime.matmul_precision import use_matmul_precision
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from stages.amounts import bytes_in_words, duration, short_count
 from stages.contract import Inputs, Progress
-from stages.effects.decisions import Decisions, image_effects, read_decisions
+from stages.effects.decisions import Decisions, read_decisions
+from stages.effects.image_effects import image_effects
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_on
 from stages.io.files import read_json, read_scene

@@ -11,7 +11,8 @@ from nerf.training.ray_dataset import RayDataset
 from nerf.training.validation_probe import make_probe
 from stages.amounts import short_count
 from stages.contract import Inputs, Progress, StageResult
-from stages.effects.decisions import image_effects, learnt_of_photos, read_decisions
+from stages.effects.decisions import read_decisions
+from stages.effects.image_effects import image_effects, learnt_effects
 from stages.hardware.device import compute_device, cores
 from stages.hardware.memory import check_memory
 from stages.io.field_files import save_field
@@ -123,7 +124,7 @@ def save(training: Training, folder: Path, progress: Progress) -> StageResult:
     assert config.downscale is not None, "plan() chooses it"
     info = {"downscale": config.downscale, "steps": run.state.step, "rays": run.state.rays}
     info["background"] = list(field_background(config, scene))
-    info |= learnt_of_photos(run.trainer, scene.of_split("train"))
+    info["effects"] = learnt_effects(run.trainer.effects, scene.of_split("train"))
     save_field(folder, run.trainer.model, info)
     write_curve(folder, config.kind, config.downscale, run.plan.is_whole, run.state.curve)
     progress.update("measuring what this machine can do")

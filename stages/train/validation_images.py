@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
+from nerf.effects import HeldOutImages
 from nerf.geometry.scene import Scene, Split
 from nerf.training.trainer import FieldTrainer
 from nerf.training.validation_probe import Patches, Probe, make_patches, make_probe, measure, pictures
 from stages.contract import Progress, StageError
-from stages.effects.decisions import told_by_neighbours
+from stages.effects.image_effects import held_out_images
 from stages.evaluate.image_metrics import ssim
 from stages.io.photos import spread
 from stages.train.config import Config
@@ -28,11 +28,11 @@ MAX_VALIDATION = 8  # where a target decides when to stop
 
 
 class Unseen(NamedTuple):
-    """Pixels and patches of some photos, and how much each training photo tells of each of these."""
+    """Pixels and patches of some photos, and these beside the training photos."""
 
     probe: Probe
     patches: Patches
-    neighbours: Tensor
+    photos: HeldOutImages
 
 
 class Target(NamedTuple):
@@ -68,7 +68,7 @@ def unseen_photos(
     return Unseen(
         make_probe(dataset, PROBE_RAYS, shown_over, PROBE_SEED),
         make_patches(dataset, PATCHES, PATCH_SIDE, shown_over, PROBE_SEED),
-        told_by_neighbours(scene, scene.of_split(split)),
+        held_out_images(scene.of_split("train"), scene.of_split(split), device),
     )
 
 
@@ -80,7 +80,7 @@ def load_metrics() -> None:
 
 def look(trainer: FieldTrainer, unseen: Unseen) -> Look:
     """How the field does on photos that it has never seen, exposed as their neighbours let expect."""
-    as_expected = trainer.effects.of_held_out(unseen.neighbours)
+    as_expected = trainer.effects.of_held_out(unseen.photos)
     psnr = measure(trainer.model, unseen.probe, as_expected).psnr
     rows = zip(*pictures(trainer.model, unseen.patches, as_expected), unseen.patches.used, strict=True)
     known = [value for row in rows if (value := ssim(*(part.cpu() for part in row))) is not None]

@@ -118,8 +118,8 @@ def points() -> bytes:
 def field() -> dict[str, bytes]:
     """A valid, tiny trained field."""
     model = VanillaNerf(VanillaSettings(depth=2, width=8, position_frequencies=2, direction_frequencies=1), seed=0)
-    exposure = {"neutral": [0.0, 0.0, 0.0], "photos": {"p0.png": [0.1, 0.0, 0.0]}}
-    info = {"background": [1, 1, 1], "downscale": 1.0, "steps": 5, "rays": 50, "exposure": exposure}
+    effects = {"exposure": {"p0.png": [0.1, 0.0, 0.0]}}
+    info = {"background": [1, 1, 1], "downscale": 1.0, "steps": 5, "rays": 50, "effects": effects}
     with tempfile.TemporaryDirectory() as folder:
         save_field(Path(folder), model, info)
         return {path.name: path.read_bytes() for path in Path(folder).iterdir()}

@@ -23,6 +23,30 @@ def contract(x: np.ndarray) -> np.ndarray:
     return x if r <= 1 else (2 - 1 / r) * x / r
 
 
+def to_ndc(x: np.ndarray, space: dict) -> np.ndarray:
+    """Normalised device coordinates (appendix C) of a camera with our axes, in [-0.9, 0.9]³."""
+    right, down, depth = np.array(space["axes"]) @ (x - space["apex"])
+    return 0.9 * np.array([*(np.array([right, down]) / depth / space["slopes"]), 1 - 2 * space["near"] / depth])
+
+
+def from_ndc(y: np.ndarray, space: dict) -> np.ndarray:
+    """The scene point again."""
+    depth = 2 * space["near"] / (1 - y[2] / 0.9)
+    return np.array([*(y[:2] / 0.9 * space["slopes"] * depth), depth]) @ np.array(space["axes"]) + space["apex"]
+
+
+def in_ndc(origin: np.ndarray, direction: np.ndarray, near: float, far: float, space: dict) -> tuple:
+    """A ray between two scene points as the one between their images; of no length behind the near plane."""
+    axis = np.array(space["axes"])[2]
+    passes = (space["near"] - axis @ (origin - space["apex"])) / (axis @ direction)
+    near, far = (max(near, passes), far) if axis @ direction > 0 else (near, min(far, passes))
+    if near >= far:
+        return np.zeros(3), np.zeros(3), 0.0, 0.0
+    start, end = to_ndc(origin + near * direction, space), to_ndc(origin + far * direction, space)
+    length = float(np.linalg.norm(end - start))
+    return start, (end - start) / length, 0.0, length
+
+
 def relu(x: np.ndarray) -> np.ndarray:
     return np.where(np.real(x) > 0, x, 0)
 
@@ -33,7 +57,7 @@ def dense(weights: Weights, name: str, x: np.ndarray) -> np.ndarray:
 
 def field(weights: Weights, net: str, settings: dict, shift: float, point: np.ndarray, direction: np.ndarray) -> tuple:
     """Density and colour of one point seen along one direction."""
-    x, d = (0.45 * contract(point) if settings["contracted"] else point), 0.9 * direction
+    x, d = (0.45 * contract(point) if settings["space"]["kind"] == "contraction" else point), 0.9 * direction
     if settings["positional_encoding"]:
         x, d = encode(x, settings["position_frequencies"]), encode(d, settings["direction_frequencies"])
     hidden = x
@@ -100,9 +124,20 @@ def render(
 
     ``jitter`` are the positions within the bins, in [0, 1), of the first and of the second sampling.
     """
-    origin, direction, near, far = ray
-    if not settings["contracted"]:
+    scene_origin, towards, near, scene_far = ray
+    origin, direction, far, space = scene_origin, towards, scene_far, settings["space"]
+    if space["kind"] == "ndc":
+        origin, direction, near, far = in_ndc(origin, direction, near, far, space)
+    if space["kind"] != "contraction":
         near, far = box_interval(origin, direction, near, far, 0.95)
+
+    def scene_distance(s: float) -> float:
+        """How far along the ray in the scene."""
+        if not direction.any():
+            return scene_far
+        at = origin + s * direction
+        return towards @ ((from_ndc(at, space) if space["kind"] == "ndc" else at) - scene_origin)
+
     first, second = jitter
     t = []
     for i in range(len(first)):
@@ -110,8 +145,9 @@ def render(
         t.append(near + u * (far - near) if settings["spacing"] == "linear" else near * (far / near) ** u)
 
     def along(net: str, t: list[float]) -> tuple:
-        asked = [field(weights, net, settings, shift, origin + s * direction, direction) for s in t]
-        return composite([a[0] for a in asked], [a[1] for a in asked], t, far, background)
+        asked = [field(weights, net, settings, shift, origin + s * direction, towards) for s in t]
+        distances, end = [scene_distance(s) for s in t], scene_distance(far)
+        return composite([a[0] for a in asked], [a[1] for a in asked], distances, end, background)
 
     if not settings["hierarchical"]:
         only = along("fine", t)[:3]

@@ -1,7 +1,7 @@
 """Which camera model the photos call for, by the error of observations that were held out. Call it in a child process.
 
-Every candidate lens adjusts cameras, poses and points to most observations and then foretells the others. The simplest
-one wins that foretells them no worse than the best by more than the noise of the comparison. A lens that is too simple
+Every candidate adjusts cameras, poses and points to most observations and predicts the others. The simplest one is
+chosen whose error exceeds the best one's by no more than the noise of the comparison. A camera model that is too simple
 bends the poses; one that is too rich fits noise, and bends them too.
 """
 
@@ -27,20 +27,20 @@ MAX_ITERATIONS = 50
 MAX_DEGENERATE_FRACTION = (
     0.2  # of the photos may have degenerate cameras: these are put right in the end, and decide for no others
 )
-NOISE_MULTIPLES = 3.0  # with a dozen rivals two standard errors are often exceeded by chance, three hardly ever
+NOISE_MULTIPLES = 3.0  # with a dozen candidates two standard errors are often exceeded by chance, three hardly ever
 
 
 class CandidateResult(NamedTuple):
     """How a candidate did."""
 
-    lens: CameraModelCandidate
+    candidate: CameraModelCandidate
     error_px: Float[np.ndarray, "n"]  # of each held-out observation
     noise_px: float  # of the observations it was adjusted to
     why_degenerate: str | None  # of one of its cameras, where more than a few photos have such
 
 
 class Selection(NamedTuple):
-    """What came of the comparison for some cameras: the trial whose lens they take, None if there is none."""
+    """The comparison for some cameras: the result of the candidate that they take, None if there is none."""
 
     cameras: list[int]
     photos: int
@@ -51,45 +51,47 @@ class Selection(NamedTuple):
 
 @dataclass
 class CameraModels:
-    """The lens of every camera that has photos, by its id, and why: a table's rows and sentences."""
+    """The model of every camera that has photos, by its id, and why: a table's rows and sentences."""
 
     noise_px: float
-    lenses: dict[int, CameraModelCandidate] = field(default_factory=dict)
+    chosen: dict[int, CameraModelCandidate] = field(default_factory=dict)
     table: list[dict[str, Any]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
 def choose(mapped: pycolmap.Reconstruction, seed: int, models: Sequence[str] = MODELS) -> CameraModels:
-    """The lens of every camera, of these models.
+    """The model of every camera, one of these.
 
     A camera is judged by its own photos alone where they share enough points, and the others all together, each
-    candidate being tried by all of them. Cameras that come out alike so are judged once more, together, since more
+    candidate being adjusted to all of them. Cameras that come out alike so are judged once more, together, since more
     observations tell finer differences. Where evidence is too little, cameras stay as mapping had them.
     """
     cameras = sorted({mapped.image(i).camera_id for i in mapped.reg_image_ids()})
     noise = noise_px(mapped, observations(mapped))
-    verdicts = [_verdict(mapped, group, seed, models, noise) for group in _groups(mapped, cameras)]
-    judged = [verdict for verdict in verdicts if verdict.chosen]
-    if len(judged) > 1 and len({verdict.chosen.lens for verdict in judged if verdict.chosen}) == 1:
-        alike = sorted(camera for verdict in judged for camera in verdict.cameras)
-        rest = [verdict for verdict in verdicts if not verdict.chosen]
-        verdicts = [_verdict(mapped, alike, seed, models, noise), *rest]
-    largest = max((v for v in verdicts if v.chosen), key=lambda v: v.photos, default=None)
+    selections = [_select(mapped, group, seed, models, noise) for group in _groups(mapped, cameras)]
+    judged = [selection for selection in selections if selection.chosen]
+    if len(judged) > 1 and len({selection.chosen.candidate for selection in judged if selection.chosen}) == 1:
+        alike = sorted(camera for selection in judged for camera in selection.cameras)
+        rest = [selection for selection in selections if not selection.chosen]
+        selections = [_select(mapped, alike, seed, models, noise), *rest]
+    largest = max((one for one in selections if one.chosen), key=lambda one: one.photos, default=None)
     choice = CameraModels(largest.chosen.noise_px if largest and largest.chosen else noise)
-    for index, (group, photos, chosen, rows, why) in enumerate(verdicts):
-        lens = chosen.lens if chosen else CameraModelCandidate(mapped.camera(group[0]).model_name, False)
-        choice.lenses |= dict.fromkeys(group, lens)
+    for index, (group, photos, chosen, rows, why) in enumerate(selections):
+        candidate = chosen.candidate if chosen else CameraModelCandidate(mapped.camera(group[0]).model_name, False)
+        choice.chosen |= dict.fromkeys(group, candidate)
         choice.table += [row | {"group": index, "photos": photos} for row in rows]
-        whose = f"{photos} photo{'s' * (photos != 1)}: " if len(verdicts) > 1 else ""
+        whose = f"{photos} photo{'s' * (photos != 1)}: " if len(selections) > 1 else ""
         given = " as given" if len(models) == 1 else ""
-        choice.notes.append(f"{whose}camera model {lens.model}{given}, principal point {lens.place}: {why}")
+        choice.notes.append(
+            f"{whose}camera model {candidate.model}{given}, principal point {candidate.principal_point_state}: {why}"
+        )
     return choice
 
 
-def _verdict(
+def _select(
     mapped: pycolmap.Reconstruction, cameras: list[int], seed: int, models: Sequence[str], noise: float
 ) -> Selection:
-    """Let every candidate foretell what these cameras saw."""
+    """Let every candidate predict what these cameras saw."""
     sample = _part(mapped, cameras)
     photos = sample.num_reg_images()
     most = max(MAX_OBSERVATIONS * photos // mapped.num_reg_images(), MAX_OBSERVATIONS_PER_IMAGE * photos)
@@ -99,10 +101,10 @@ def _verdict(
         if photos < 3:  # however many points there are
             why = "camera models are compared by points that three photos of a camera see"
         return Selection(cameras, photos, None, [], why)
-    trials = list(_trials(sample, held_out, models, noise))
+    results = list(_results(sample, held_out, models, noise))
     cells = _cells(held_out, mapped)
-    chosen, rows = _judge(trials, cells)
-    return Selection(cameras, photos, chosen, rows, _reason(chosen, trials, cells))
+    chosen, rows = _choose(results, cells)
+    return Selection(cameras, photos, chosen, rows, _reason(chosen, results, cells))
 
 
 def _groups(mapped: pycolmap.Reconstruction, cameras: list[int]) -> list[list[int]]:
@@ -164,7 +166,7 @@ def _cells(seen: Observations, model: pycolmap.Reconstruction) -> Int[np.ndarray
     return (seen.image * CELLS + row) * CELLS + column
 
 
-def _trials(
+def _results(
     sample: pycolmap.Reconstruction, held_out: Observations, models: Sequence[str], noise: float
 ) -> Iterator[CandidateResult]:
     """Every candidate adjusted to the sample; with a refined principal point it goes on from where it was centred."""
@@ -196,8 +198,8 @@ def _adjust(model: pycolmap.Reconstruction, principal_point: bool, noise: float)
 def adjustment_options(principal_point: bool, noise: float) -> pycolmap.BundleAdjustmentOptions:
     """Of comparison and final adjustment alike.
 
-    Residuals r count by soft-L1, 2s²(√(1 + (r/s)²) − 1), with s the ``noise`` of the observations: beyond it they pull
-    with a force that grows no more, so that the mismatches that remain do not bend the cameras. Were the noise
+    Residuals r count by soft-L1, 2s²(√(1 + (r/s)²) − 1), with s the ``noise`` of the observations: beyond it their
+    gradient grows no more, so that the mismatches that remain do not bend the cameras. Were the noise
     Gaussian, this would cost 7 % of its efficiency (Huber 1981, section 7.6: E[ψ']² / E[ψ²] in two dimensions).
     """
     options = pycolmap.BundleAdjustmentOptions(refine_principal_point=principal_point, print_summary=False)
@@ -208,29 +210,31 @@ def adjustment_options(principal_point: bool, noise: float) -> pycolmap.BundleAd
     return options
 
 
-def _judge(
-    trials: list[CandidateResult], cells: Int[np.ndarray, "n"]
+def _choose(
+    results: list[CandidateResult], cells: Int[np.ndarray, "n"]
 ) -> tuple[CandidateResult | None, list[dict[str, Any]]]:
-    """The trial whose lens to take, None if all are degenerate, and the table."""
+    """The result of the candidate to take, None if all are degenerate, and the table."""
     chosen, excess = None, {}
-    if sound := [trial for trial in trials if not trial.why_degenerate]:
-        best = min(sound, key=lambda trial: trial.error_px.mean())
-        excess = {trial.lens: paired(trial.error_px - best.error_px, cells) for trial in sound}
-        able = [trial for trial in sound if excess[trial.lens][0] <= NOISE_MULTIPLES * excess[trial.lens][1]]
-        chosen = min(able, key=lambda trial: (trial.lens.complexity, trial.error_px.mean()))
+    if sound := [result for result in results if not result.why_degenerate]:
+        best = min(sound, key=lambda result: result.error_px.mean())
+        excess = {result.candidate: paired(result.error_px - best.error_px, cells) for result in sound}
+        able = [
+            result for result in sound if excess[result.candidate][0] <= NOISE_MULTIPLES * excess[result.candidate][1]
+        ]
+        chosen = min(able, key=lambda result: (result.candidate.complexity, result.error_px.mean()))
     rows = []
-    for trial in trials:
-        worse, noise = excess.get(trial.lens, (None, None))
+    for result in results:
+        worse, noise = excess.get(result.candidate, (None, None))
         rows.append(
             {
-                "model": trial.lens.model,
-                "principal_point": trial.lens.place,
-                "free_parameters": trial.lens.free_parameters,
-                "held_out_px": None if trial.why_degenerate else float(trial.error_px.mean()),
+                "model": result.candidate.model,
+                "principal_point": result.candidate.principal_point_state,
+                "free_parameters": result.candidate.free_parameters,
+                "held_out_px": None if result.why_degenerate else float(result.error_px.mean()),
                 "worse_px": worse,
                 "noise_px": noise,
-                "chosen": trial is chosen,
-                "reason": trial.why_degenerate,
+                "chosen": result is chosen,
+                "reason": result.why_degenerate,
             }
         )
     return chosen, rows
@@ -244,15 +248,15 @@ def paired(difference: Float[np.ndarray, "n"], cells: Int[np.ndarray, "n"]) -> t
     return mean, float(np.sqrt((sums**2).sum() * len(sums) / max(len(sums) - 1, 1)) / len(difference))
 
 
-def _reason(chosen: CandidateResult | None, trials: list[CandidateResult], cells: Int[np.ndarray, "n"]) -> str:
+def _reason(chosen: CandidateResult | None, results: list[CandidateResult], cells: Int[np.ndarray, "n"]) -> str:
     if chosen is None:
         return "every candidate is degenerate, so it stays as mapping had it"
     error = f"held-out error {chosen.error_px.mean():.2f} px"
-    simpler = [trial for trial in trials if not trial.why_degenerate and trial.lens.complexity < chosen.lens.complexity]
+    sound = [result for result in results if not result.why_degenerate]
+    simpler = [result for result in sound if result.candidate.complexity < chosen.candidate.complexity]
     if not simpler:
         return f"{error}, and no richer one is better by more than the noise"
-    rival = min(simpler, key=lambda trial: trial.error_px.mean())
-    worse, noise = paired(rival.error_px - chosen.error_px, cells)
-    return (
-        f"{error}, {rival.lens.model} ({rival.lens.place}) as the best simpler one {worse:.3f} ± {noise:.3f} px worse"
-    )
+    best = min(simpler, key=lambda result: result.error_px.mean())
+    worse, noise = paired(best.error_px - chosen.error_px, cells)
+    name = f"{best.candidate.model} ({best.candidate.principal_point_state})"
+    return f"{error}, {name} as the best simpler one {worse:.3f} ± {noise:.3f} px worse"

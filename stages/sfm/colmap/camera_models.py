@@ -38,7 +38,7 @@ class CameraModelCandidate(NamedTuple):
 
     @property
     def complexity(self) -> tuple[bool, int]:
-        """The simpler of two lenses has the smaller one.
+        """The simpler of two candidates has the smaller one.
 
         Ordinary lenses are made to draw straight lines straight, and at their angles a fisheye's series describes
         much the same rays. So a fisheye model counts as less simple than all others, however few its numbers.
@@ -46,13 +46,14 @@ class CameraModelCandidate(NamedTuple):
         return is_fisheye(self.model), self.free_parameters
 
     @property
-    def place(self) -> str:
+    def principal_point_state(self) -> str:
         """What becomes of the principal point, in a word."""
         return "refined" if self.principal_point else "fixed"
 
 
-def set_camera_models(model: pycolmap.Reconstruction, lenses: dict[int, str]) -> None:
-    """Give cameras (by id) the models named and centred principal points, to draw their points where they were drawn.
+def set_camera_models(model: pycolmap.Reconstruction, names: dict[int, str]) -> None:
+    """Give cameras (by id) the models named and centred principal points; their points are projected where
+    they were before.
 
     Cameras without points stay as they are.
     """
@@ -60,7 +61,7 @@ def set_camera_models(model: pycolmap.Reconstruction, lenses: dict[int, str]) ->
     points: dict[int, list[np.ndarray]] = {}
     for image_id, (_, mine) in points_in_camera(model, seen).items():
         points.setdefault(model.image(image_id).camera_id, []).append(mine)
-    for camera_id, name in lenses.items():
+    for camera_id, name in names.items():
         camera = model.camera(camera_id)
         middle = [camera.width / 2, camera.height / 2]
         centred = [camera.params[i] for i in camera.principal_point_idxs()] == middle
@@ -82,12 +83,12 @@ def _fitted(camera: pycolmap.Camera, name: str, points: Float[np.ndarray, "n 3"]
     free = np.setdiff1d(np.arange(len(params)), centre)
     unit = np.where(np.isin(free, focal), camera.mean_focal_length(), 1.0)
 
-    def misses(x: np.ndarray) -> np.ndarray:
+    def residuals(x: np.ndarray) -> np.ndarray:
         params[free] = x * unit
         new.params = params.tolist()
         return (np.asarray(new.img_from_cam(points)) - target).ravel()
 
-    misses(least_squares(misses, params[free] / unit).x)
+    residuals(least_squares(residuals, params[free] / unit).x)
     return new
 
 

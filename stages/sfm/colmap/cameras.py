@@ -30,6 +30,15 @@ def camera_rays(camera: Camera, width: int, height: int) -> Float[np.ndarray, "h
     return rays
 
 
+def border_rays(camera: Camera) -> Float[np.ndarray, "border 3"]:
+    """Unit ray directions of pixel centres along the outline of a camera's image, CHECKED_PIXELS of them a side."""
+    sides = zip((camera.width, camera.height), CHECKED_PIXELS, strict=True)
+    x, y = (np.linspace(0.5, length - 0.5, count) for length, count in sides)
+    across = [np.stack([x, np.full_like(x, end)], axis=1) for end in (y[0], y[-1])]
+    down = [np.stack([np.full_like(y, end), y], axis=1) for end in (x[0], x[-1])]
+    return _ray_directions(native(camera), np.concatenate(across + down))[0]
+
+
 def share_without_ray(model: pycolmap.Camera) -> float:
     """Of a camera's pixels, seen at CHECKED_PIXELS of them, the share for which the camera model has no inverse."""
     sides = zip((model.width, model.height), CHECKED_PIXELS, strict=True)
@@ -55,7 +64,7 @@ def no_ray(camera: Camera, share: float, of: str = "") -> StageError:
         "sfm.no-ray",
         f"the {camera.model} camera{f' of {of!r}' * bool(of)} has no ray for {100 * share:.3g}% of its pixels",
         f"{why_no_ray(camera.model)} there (parameters {', '.join(f'{p:.5g}' for p in camera.params)})",
-        f"Check the distortion of the given cameras, or {other}.",
+        f"Check the distortion of the imported cameras, or {other}.",
     )
 
 

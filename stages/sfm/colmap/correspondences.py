@@ -71,7 +71,7 @@ def read_pair_matches(
 
 
 def _directions(db: pycolmap.Database, model: pycolmap.Reconstruction, image_id: int) -> np.ndarray:
-    """Unit rays of a photo's keypoints in its camera's frame; along the axis where the lens has none."""
+    """Unit rays of a photo's keypoints in its camera's frame; along the axis where the camera model has none."""
     xy = np.array(db.read_keypoints(image_id), float).reshape(-1, 6)[:, :2]
     rays = np.asarray(model.camera(model.image(image_id).camera_id).cam_ray_from_img(xy), float).reshape(-1, 3)
     return np.where(np.isfinite(rays).all(axis=1, keepdims=True), rays, [0.0, 0.0, 1.0])

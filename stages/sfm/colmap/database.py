@@ -22,15 +22,15 @@ from stages.sfm.pairs.feature_matching import IndexedFeatures, index_features, m
 from stages.sfm.pairs.image_retrieval import WORDS, Words, photo_similarity, vocabulary
 from stages.sfm.pairs.pair_selection import Pairs, SimilarityMatrix
 
-FOCAL_GUESS = 1.2  # focal length over the longer side where EXIF is silent: 45 degrees, a phone's wide lens
+FOCAL_GUESS = 1.2  # focal length over the longer side where EXIF is silent: 45 degrees, a phone's main camera
 # Lowe's ratio: 0.8 is SIFT's own. 0.9 lets in many mismatches, most of which verification throws out again, and
-# finds views that lie farther apart; only photos that otherwise stay without a place are matched like that.
+# finds views that lie farther apart; only photos that otherwise stay unregistered are matched like that.
 STRICT_RATIO = 0.8
 RELAXED_RATIO = 0.9
 BLOCK_SIZE = 32  # pairs of photos that are committed at once (progress, resuming)
 FISHEYE_MODEL = "SIMPLE_RADIAL_FISHEYE"
 FISHEYE_ANGLE_DEG = 150.0
-BYTES_PER_SEARCHED_PIXEL = 100  # 77 to 86 measured on photos of 1024 to 3200 pixels
+BYTES_PER_PIXEL = 100  # 77 to 86 measured on photos of 1024 to 3200 pixels
 OPENINGS, PAUSE_SECONDS = 50, 0.1  # a reader holds the lock for milliseconds
 CACHED_PHOTOS = 256  # whose features are held in memory, about half a megabyte each
 
@@ -89,7 +89,7 @@ def _first_guess(photo: Photo, model: str, params: Sequence[float] | None, camer
 
 
 def fisheye_focal_px(width: int, height: int) -> float:
-    """Of an equidistant lens, r = f θ, with FISHEYE_ANGLE_DEG from corner to corner."""
+    """Of an equidistant camera, r = f θ, with FISHEYE_ANGLE_DEG from corner to corner."""
     return math.hypot(width, height) / math.radians(FISHEYE_ANGLE_DEG)
 
 
@@ -101,8 +101,8 @@ def _enter_camera(db: pycolmap.Database, camera: pycolmap.Camera) -> None:
 
 
 class ExtractionOptions(NamedTuple):
-    """How far features are searched: the longer side in pixels that photos are reduced to, the most features of each,
-    the folder of masks, and up to which longer side photos are doubled first: smaller ones yield too few features."""
+    """How features are extracted: the longer side in pixels that photos are reduced to, the maximum for each photo, the
+    folder of masks, and up to which longer side photos are doubled first: smaller ones yield too few features."""
 
     max_image_size: int
     max_features: int
@@ -110,31 +110,31 @@ class ExtractionOptions(NamedTuple):
     doubled_up_to: int = 1024
 
 
-def feature_bytes(photos: Sequence[Photo], search: ExtractionOptions) -> float:
-    """Memory that searching the largest of the photos takes, by its pixels as they are searched."""
+def feature_bytes(photos: Sequence[Photo], extraction: ExtractionOptions) -> float:
+    """Memory that feature extraction takes for the largest of the photos, by its pixels as they are used."""
 
-    def searched(photo: Photo) -> float:
+    def used_pixels(photo: Photo) -> float:
         longer = max(photo.width, photo.height)
-        scale = min(1.0, search.max_image_size / longer) * (2 if longer <= search.doubled_up_to else 1)
+        scale = min(1.0, extraction.max_image_size / longer) * (2 if longer <= extraction.doubled_up_to else 1)
         return photo.width * photo.height * scale**2
 
-    return BYTES_PER_SEARCHED_PIXEL * max(map(searched, photos))
+    return BYTES_PER_PIXEL * max(map(used_pixels, photos))
 
 
-def extract_features(database: Path, images: Path, photos: Sequence[Photo], search: ExtractionOptions) -> None:
+def extract_features(database: Path, images: Path, photos: Sequence[Photo], extraction: ExtractionOptions) -> None:
     """SIFT keypoints and descriptors of every photo that has none yet, where ``masks/<image name>.png`` is not black,
     or anywhere where that is not there.
 
-    Photos are searched from their own size down. Doubling them first, as is COLMAP's habit, costs 4.5 times as
+    The scale space begins at the photos' own size. Doubling them first, as is COLMAP's habit, costs 4.5 times as
     much and moves no camera of a well-sized photo (benchmarks/sfm_accuracy.py), so only small ones are doubled.
     """
     options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size = search.max_image_size
-    options.sift.max_num_features = search.max_features
-    options.num_threads = at_once(processors(), feature_bytes(photos, search))
+    options.max_image_size = extraction.max_image_size
+    options.sift.max_num_features = extraction.max_features
+    options.num_threads = at_once(processors(), feature_bytes(photos, extraction))
     every = [photo.image_name for photo in photos]
-    small = {p.image_name for p in photos if max(p.width, p.height) <= search.doubled_up_to}
-    masks = search.masks
+    small = {p.image_name for p in photos if max(p.width, p.height) <= extraction.doubled_up_to}
+    masks = extraction.masks
     masked = {name for name in every if masks and (masks / f"{name}.png").is_file()}
     # A photo without a mask has to go without a folder of masks: one that is not there is an error to COLMAP.
     for is_small, is_masked in product((True, False), (False, True)):
@@ -196,7 +196,7 @@ def _spread(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
 
 class _Photo(NamedTuple):
     camera: pycolmap.Camera
-    places: np.ndarray  # (keypoints, 2), pixels
+    keypoints: np.ndarray  # (keypoints, 2), pixels
     features: Any  # descriptors, (keypoints, 128) bytes, or IndexedFeatures of them
 
 
@@ -273,7 +273,7 @@ def _verification(seed: int) -> pycolmap.TwoViewGeometryOptions:
 def _verified(
     first: _Photo, second: _Photo, matches: np.ndarray, options: pycolmap.TwoViewGeometryOptions
 ) -> pycolmap.TwoViewGeometry:
-    views = first.camera, first.places, second.camera, second.places
+    views = first.camera, first.keypoints, second.camera, second.keypoints
     return pycolmap.estimate_two_view_geometry(*views, matches, options)
 
 
@@ -311,7 +311,7 @@ def keep_inliers(
 
 
 def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:
-    """Copy the database, its cameras become fisheye lenses and its matches verified anew; nothing where it is there.
+    """Copy the database, its cameras become fisheyes and its matches verified anew; nothing where it is there.
 
     Without EXIF the focal length is :func:`fisheye_focal_px`, and counts as known.
     """
@@ -322,9 +322,9 @@ def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:
         for camera in db.read_all_cameras():
             size = camera.width, camera.height
             focal_px = camera.mean_focal_length() if camera.has_prior_focal_length else fisheye_focal_px(*size)
-            lens = pycolmap.Camera.create_from_model_name(camera.camera_id, FISHEYE_MODEL, focal_px, *size)
-            lens.has_prior_focal_length = True
-            db.update_camera(lens)
+            fisheye = pycolmap.Camera.create_from_model_name(camera.camera_id, FISHEYE_MODEL, focal_px, *size)
+            fisheye.has_prior_focal_length = True
+            db.update_camera(fisheye)
         photo = partial(Features().read, db)
         for pair_id, matches in zip(*db.read_all_matches(), strict=True):
             first, second = pycolmap.pair_id_to_image_pair(pair_id)

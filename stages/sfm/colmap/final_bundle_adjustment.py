@@ -13,9 +13,9 @@ from stages.sfm.colmap.mapping import pipeline_options
 from stages.sfm.colmap.observations import noise_px, observations
 from stages.sfm.colmap.uncertainty import pose_uncertainty_px
 
-# The first choice can only go by what mapping's lens let in. Where another one lets in a tenth more, mostly from the
-# borders of wide photos, that is where it shows what it is worth.
-MANY_MORE = 1.1
+# The first choice can only go by the observations that fit mapping's camera model. Where those of another one are a
+# tenth more, mostly at the borders of wide photos, these tell the models apart.
+MIN_GROWTH_TO_CHOOSE_AGAIN = 1.1
 SIMPLEST = MODELS[0]
 CLOSING_STEPS = (3, 3)  # of the adjustment of all observations, before and after those that fit no more are dropped
 
@@ -41,10 +41,10 @@ def final_bundle_adjustment(
 ) -> AdjustedModel:
     """Choose the camera model by held-out observations, unless it is given, and adjust everything with it.
 
-    Of a given model it is only chosen whether its principal point is refined; a known lens is kept as it is. Where many
-    more observations fit the chosen lens than mapping's, the choice is made again with them. No camera of the model is
-    degenerate in the end, unless those of most photos are. Of a model of ``thinned`` matches (thinning.py) the tracks
-    that it has are adjusted first; then all matches come back.
+    Of a given model it is only chosen whether its principal point is refined; known intrinsics are kept as they are.
+    Where many more observations fit the chosen model than mapping's, the choice is made again with them. No camera of
+    the model is degenerate in the end, unless those of most photos are. Of a model of ``thinned`` matches (thinning.py)
+    the tracks that it has are adjusted first; then all matches come back.
     """
     if camera_is_known:
         choice = CameraModels(noise_px(mapped, observations(mapped)), notes=["the camera is kept as given"])
@@ -55,7 +55,10 @@ def final_bundle_adjustment(
     models = (camera_model,) if camera_model else MODELS
     choice = choose(mapped, seed, models)
     model = _adjusted(mapped, database, seed, choice, thinned)
-    if not thinned and model.compute_num_observations() > MANY_MORE * mapped.compute_num_observations():
+    if (
+        not thinned
+        and model.compute_num_observations() > MIN_GROWTH_TO_CHOOSE_AGAIN * mapped.compute_num_observations()
+    ):
         choice = choose(model, seed, models)
         model = _adjusted(model, database, seed, choice, thinned)
     _simplify_degenerate(model, database, seed, choice)
@@ -113,12 +116,12 @@ def _adjusted(
 ) -> pycolmap.Reconstruction:
     adjust = _adjust_thinned if thinned else _adjust
     model = pycolmap.Reconstruction(before)
-    set_camera_models(model, {camera_id: lens.model for camera_id, lens in choice.lenses.items()})
-    centred = {camera_id for camera_id, lens in choice.lenses.items() if not lens.principal_point}
+    set_camera_models(model, {camera_id: candidate.model for camera_id, candidate in choice.chosen.items()})
+    centred = {camera_id for camera_id, candidate in choice.chosen.items() if not candidate.principal_point}
     # Whether to refine principal points holds for all cameras at once: those that keep theirs are adjusted before.
     if centred:
         adjust(model, database, seed, set(), adjustment_options(False, choice.noise_px))
-    if centred != choice.lenses.keys():
+    if centred != choice.chosen.keys():
         adjust(model, database, seed, centred, adjustment_options(True, choice.noise_px))
     return model
 

@@ -48,6 +48,13 @@ def check_model(model: pycolmap.Reconstruction, database: Path, seed: int) -> Ch
     return Checked(ids, matches, check_poses(matches, camera_poses(model)))
 
 
+def agreeing_pairs(model: pycolmap.Reconstruction, database: Path, seed: int, files: Container[str]) -> int:
+    """How many verified pairs with one of these images agree with the model's poses."""
+    ids, matches, check = check_model(model, database, seed)
+    among = np.array([model.image(image_id).name in files for image_id in ids], bool)
+    return int((check.agrees & among[matches.pairs].any(axis=1)).sum())
+
+
 def camera_poses(model: pycolmap.Reconstruction) -> Float[np.ndarray, "photos 3 4"]:
     """World from camera of every registered photo, in order of image id."""
     poses = [model.image(i).cam_from_world().inverse().matrix() for i in sorted(model.reg_image_ids())]

@@ -24,7 +24,7 @@ def thin_matches(database: Path, copy: Path, tracks: int = TRACKS_PER_PHOTO) -> 
     """Copy the database with the verified matches of each photo's best ``tracks`` tracks alone.
 
     Focal lengths that nothing tells are calibrated by all pairs together in the copy: mapping that begins with a guess
-    that is a fifth off can take minutes to leave it, or end with a lens that draws everything wrong.
+    that is a fifth off can take minutes to leave it, or end with intrinsics that project everything wrongly.
     """
     unfinished = unfinished_copy(database, copy)
     with pycolmap.Database.open(unfinished) as db:

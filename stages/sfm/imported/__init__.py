@@ -1,1 +1,1 @@
-"""Cameras that are known already: read, turned upright, written as a model, checked."""
+"""Imported poses: read, turned upright, written as a model, checked."""

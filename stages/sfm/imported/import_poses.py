@@ -1,4 +1,4 @@
-"""Cameras that are known already: read, written as a model, checked against what the photos show."""
+"""Imported poses: read, written as a model, checked against what the photos show."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,12 +27,12 @@ MAX_NAMES = 5
 def import_poses(
     cameras: Path, convention: PoseConvention, photos: Sequence[Photo], ingest: Path, folder: Path, progress: Progress
 ) -> dict[str, Any]:
-    """Write ``sparse/`` from known cameras, and check them against the photos: what registration.json says of them.
+    """Write ``sparse/`` from imported poses, and check them against the photos: what registration.json says of them.
 
     Raises StageError where they cannot be used, and where their photos show that they are of another convention.
     """
     known, errors = write_imported_model(cameras, convention, photos, ingest, folder, progress)
-    check = _check_given(known.model, photos, ingest, folder, progress)
+    check = _check(known.model, photos, ingest, folder, progress)
     if check and (fit := check.pop("fit")):
         read_as = convention.with_defaults(convention_of_format(cameras))
         raise _another_convention(cameras.name, check, Fit(**fit), read_as)
@@ -94,29 +94,29 @@ def _another_convention(name: str, check: dict[str, Any], fit: Fit, read_as: Pos
     )  # fmt: skip
 
 
-def _check_given(
+def _check(
     model: SparseModel, photos: Sequence[Photo], ingest: Path, folder: Path, progress: Progress
 ) -> dict[str, Any] | None:
-    """What verified matches of neighbouring photos say of given cameras; None, said, where they say nothing."""
+    """What verified matches of neighbouring photos say of imported poses; None, with a note, where they say nothing."""
     progress.update("comparing the cameras with what neighbouring photos show")
     posed = {image.file for image in model.images}
     check = check_imported_poses([photo for photo in photos if photo.image_name in posed], ingest / "images", folder)
     if why := check.get("failed"):
-        progress.note(f"the given cameras could not be checked: {why}")
+        progress.note(f"the imported poses could not be checked: {why}")
         return None
     return check
 
 
 def _note_doubts(check: dict[str, Any], model: SparseModel, photos: Sequence[Photo], progress: Progress) -> None:
-    """Say so where photos contradict their given cameras."""
+    """Note where photos contradict their imported poses."""
     if 2 * check["agreeing"] < check["pairs"]:
         progress.note(
-            f"the given cameras contradict their photos: {check['agreeing']} of {check['pairs']} verified pairs agree "
+            f"the imported poses contradict their photos: {check['agreeing']} of {check['pairs']} verified pairs agree "
             "with them, and more do under no other convention. Check what they are of, or leave out --cameras"
         )
     elif check["doubtful"]:
         names = {photo.image_name: photo.name for photo in photos}
         who = listed([names[file] for file in check["doubtful"]], MAX_NAMES)
         progress.note(
-            f"{len(check['doubtful'])} of {len(model.images)} given cameras contradict what their photos show: {who}"
+            f"{len(check['doubtful'])} of {len(model.images)} imported poses contradict what their photos show: {who}"
         )

@@ -35,8 +35,8 @@ def fits_only_upright(camera: Camera, photo: Photo) -> bool:
 
 
 def is_of_stored_pixels(camera: Camera, photo: Photo, upright: bool) -> bool:
-    """Whether a given camera is one of the photo as its file stores it, turned or mirrored. The shape tells; where both
-    would do (a half turn, a square), it is, unless it is known to be ``upright``."""
+    """Whether an imported camera is one of the photo as its file stores it, turned or mirrored. The shape tells; where
+    both would do (a half turn, a square), it is, unless it is known to be ``upright``."""
     if photo.orientation == 1 or not same_shape(camera, stored_size(photo)):
         return False
     return not (upright and same_shape(camera, (photo.width, photo.height)))

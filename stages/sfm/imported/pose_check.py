@@ -1,4 +1,4 @@
-"""Whether cameras that were given fit their photos, in a child process: COLMAP may abort.
+"""Whether imported poses fit their photos, in a child process: COLMAP may abort.
 
 Features of reduced photos are matched between neighbours by pose, which the check of stages/sfm/geometry_check.py
 judges. ``python -P -m stages.sfm.imported.pose_check`` reads a job from stdin as one line of JSON and answers with
@@ -39,7 +39,7 @@ from stages.sfm.worker_process import environment
 COMMAND = ["-P", "-m", "stages.sfm.imported.pose_check"]
 MAX_IMAGE_SIZE, MAX_FEATURES = 1000, 2000  # enough to tell a step of a few pixels, in seconds for hundreds of photos
 PARTNERS = 6  # of each photo
-NEXT = 2  # places before and after it, in the order of names
+MAX_NAME_STEPS = 2  # positions before and after it, in the order of names
 TURN_DEG = 30.0  # two photos whose axes differ by so much count as far apart as two whose centres are usual neighbours
 MIN_PAIRS = 3  # verified pairs, for there to be any evidence
 
@@ -83,13 +83,13 @@ def check(photos: list[dict[str, Any]], images: str, folder: str) -> dict[str, A
     database, masks = scratch / "check.db", scratch / "masks"
     model = load_native(Path(folder, "sparse"))
     fill_database(database, some, MAPPING_MODEL)
-    search = ExtractionOptions(MAX_IMAGE_SIZE, MAX_FEATURES, doubled_up_to=MAX_IMAGE_SIZE // 2)
+    extraction = ExtractionOptions(MAX_IMAGE_SIZE, MAX_FEATURES, doubled_up_to=MAX_IMAGE_SIZE // 2)
     if write_feature_masks(Path(images).parent, some, masks):
-        search = search._replace(masks=masks)
-    extract_features(database, Path(images), some, search)
+        extraction = extraction._replace(masks=masks)
+    extract_features(database, Path(images), some, extraction)
     poses = camera_poses(model)
     by_name = natural_order([photo.name for photo in some])  # where poses are wrong, so are their neighbours
-    pairs = union(neighbours_by_pose(poses), pairs_apart(by_name, 1, NEXT))
+    pairs = union(neighbours_by_pose(poses), pairs_apart(by_name, 1, MAX_NAME_STEPS))
     match_pairs(database, pairs, 0, STRICT_RATIO)
     verified = int((verified_matches(database, pairs) >= MIN_INLIERS).sum())
     checked = check_model(model, database, 0) if verified >= MIN_PAIRS else None

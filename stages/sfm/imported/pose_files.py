@@ -1,4 +1,4 @@
-"""Cameras that are known already: transforms.json, Blender's transforms_train/test.json, COLMAP models, LLFF's file.
+"""Imported poses: transforms.json, Blender's transforms_train/test.json, COLMAP models, LLFF's file.
 
 Poses in transforms files are world_from_camera with OpenGL axes (x right, y up, z backward), in COLMAP models
 camera_from_world with OpenCV axes, unless the user says otherwise; here they become world_from_camera with OpenCV axes.
@@ -46,7 +46,7 @@ MAX_STRETCH_DEG, NOTED_STRETCH_DEG = 0.05, 0.005
 SCALED_WITHIN = 1e-3  # of 1: what rounding makes of a rotation's scale
 MAX_ENTRY = 1e6  # of a matrix that is looked at more closely: products of three of them are numbers
 MAX_NAMES, MAX_NAMES_OF_ERROR = 5, 2
-APPROXIMATION = "approximation"  # how the note begins of a lens that is not the one it stands for
+APPROXIMATION = "approximation"  # how the note begins of a camera model that stands for another
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class ImportedPoses:
             {
                 "file": file,
                 "registered": file in observations,
-                "reason": reasons.get(file, "the given cameras have none for it"),
+                "reason": reasons.get(file, "it has no imported pose"),
                 "keypoints": observations.get(file, 0),
                 "observations": observations.get(file, 0),
             }
@@ -148,7 +148,7 @@ def _from_transforms(
     if repeated:
         notes.append(f"{len(repeated)} frames are listed twice, alike: {_few(repeated)}")
     if approximate:
-        notes.append(f"the lenses of {approximate} frames are approximations, as their notes in the file say")
+        notes.append(f"the camera models of {approximate} frames are approximations, as their notes in the file say")
     if not framed:
         raise _nothing_matches(splits[0][0], absent, photos)
     notes += _contradictions([content for _, content in splits], framed)
@@ -271,8 +271,8 @@ def _rigid(matrix: Any, name: str) -> tuple[Float[np.ndarray, "3 4"], _Rotation]
         pose = pose_matrix(matrix)
     except ValueError as error:
         raise unusable("sfm.frame-pose", f"frame {name!r}", str(error)) from error
-    if (place := np.abs(pose[:, 3]).max()) > MAX_COORDINATE:
-        why = f"its place is {place:.3g} units from the origin, and the most is {MAX_COORDINATE:g}"
+    if (distance := np.abs(pose[:, 3]).max()) > MAX_COORDINATE:
+        why = f"its position is {distance:.3g} units from the origin, and the most is {MAX_COORDINATE:g}"
         raise unusable("sfm.pose-far-away", f"the transform_matrix of frame {name!r}", why)
     if not (largest := np.abs(pose[:, :3]).max()) <= MAX_ENTRY:
         raise unusable(
@@ -406,8 +406,14 @@ def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
     found: dict[int, Photo] = {}
     taken: set[str] = set()
     by_own, by_given = {photo.name: photo for photo in photos}, {photo.image_name: photo for photo in photos}
-    tiers = (by_own, by_given, _by_key(names, photos, _composed), _by_folder(names, photos), _by_end(names, photos))
-    for photo_of in (*tiers, _by_key(names, photos, _without_ending)):
+    candidates = (
+        by_own,
+        by_given,
+        _by_key(names, photos, _composed),
+        _by_folder(names, photos),
+        _by_end(names, photos),
+    )
+    for photo_of in (*candidates, _by_key(names, photos, _without_ending)):
         for index, name in enumerate(names):
             photo = photo_of.get(name)
             if photo is not None and index not in found and photo.name not in taken:

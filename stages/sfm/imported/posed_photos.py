@@ -1,4 +1,4 @@
-"""Given cameras as those of upright photos: turned with them, of their size, with a ray for every pixel."""
+"""Imported poses as those of upright photos: turned with them, of their size, with a ray for every pixel."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -37,15 +37,15 @@ def posed_photo(
     photo: Photo, name: str, camera: Camera, world_from_camera: Float[np.ndarray, "3 4"], upright: bool
 ) -> PosedPhoto:
     """A camera, given under ``name``, as one of the upright photo; ``upright`` is as :func:`is_of_stored_pixels` has
-    it. Raises StageError, with the name, for a lens that is none and for another shape than the photo's."""
+    it. Raises StageError, with the name, for a camera that is none and for another shape than the photo's."""
     turns = _turns(photo, camera, name, upright)
     camera = _at_size_of(photo, turned_camera(camera, turns), name)
     return PosedPhoto(photo, name, camera, turned_pose(world_from_camera, turns), turns)
 
 
 def _turns(photo: Photo, camera: Camera, name: str, upright: bool) -> int:
-    """How many quarter turns clockwise make a given camera one of the upright photo. Raises StageError for a lens that
-    is none, and where the photo was mirrored, which no camera can be."""
+    """How many quarter turns clockwise make an imported camera one of the upright photo. Raises StageError for a camera
+    that is none, and where the photo was mirrored, which no camera can be."""
     if why_degenerate := why_unusable(camera):
         raise unusable("sfm.degenerate-camera", f"the camera of {name!r}", why_degenerate)
     if not is_of_stored_pixels(camera, photo, upright):
@@ -75,13 +75,13 @@ def _at_size_of(photo: Photo, camera: Camera, name: str) -> Camera:
 
 
 def without_rays(posed: Collection[PosedPhoto]) -> dict[str, str]:
-    """Which photos have a lens without a ray for some of their pixels, by file, and what is to be said of it. Raises
+    """Which photos have a camera without a ray for some of their pixels, by file, and what is to be said of it. Raises
     StageError, with a name, where half of them have: without these there is no scene."""
     lost = {camera: share_without_ray(native(camera)) for camera in {one.camera for one in posed}}
     bent = [one for one in posed if lost[one.camera]]
     if bent and 2 * len(bent) >= len(posed):
         raise no_ray(bent[0].camera, lost[bent[0].camera], of=bent[0].name)
-    why = "its given camera cannot be used"
+    why = "its imported camera cannot be used"
     return {
         one.file: f"{why}: {why_no_ray(one.camera.model)} at {100 * lost[one.camera]:.3g}% of the pixels"
         for one in bent

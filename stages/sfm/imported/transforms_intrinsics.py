@@ -18,14 +18,14 @@ MAX_LETTERS = 40  # of a value, in an error
 FISHEYE, PRISM, RATIONAL, PANORAMA = "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "FULL_OPENCV", "EQUIRECTANGULAR"
 PERSPECTIVES = ("", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", RATIONAL)
 FISHEYES = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", FISHEYE, PRISM)
-OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")  # keys that declare them to instant-ngp
+OTHER_CAMERA_MODELS = ("ftheta_p0", "latlong", "equirectangular")  # keys that declare them to instant-ngp
 NERFSTUDIOS = ("k1", "k2", "k3", "k4", "p1", "p2")  # distortion_params, in nerfstudio's order
 NO_PANORAMAS = "panoramas are not supported"
 # Keys that tell one thing together: a frame that has one of a group has the group, and the file's count no more.
 FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 CENTRE = ("cx", "cy")
 DISTORTION = ("distortion_params", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
-LENS = ("camera_model", "is_fisheye", *OTHER_LENSES)
+CAMERA_MODEL = ("camera_model", "is_fisheye", *OTHER_CAMERA_MODELS)
 SAME_WITHIN = 0.01  # two focal lengths, relatively: files are rounded
 
 
@@ -33,13 +33,13 @@ def intrinsics_of(frame: Mapping[str, Any], file: Mapping[str, Any]) -> dict[str
     """The values that hold for one frame of a transforms file: its own, and the file's of each group of intrinsics that
     the frame does not have. A value that is null counts as absent.
 
-    A frame's ``camera_angle_x`` so overrules the ``fl_x`` of its file. Distortion belongs to a lens: where the frame
-    declares another one than the file, the file's terms are not the frame's.
+    A frame's ``camera_angle_x`` so overrules the ``fl_x`` of its file. Distortion belongs to a camera model: where the
+    frame declares another one than the file, the file's terms are not the frame's.
     """
     own, shared = ({key: value for key, value in of.items() if value is not None} for of in (frame, file))
-    other_lens = any(key in own and own[key] != shared.get(key, False) for key in LENS)
-    for group in (FOCAL, CENTRE, DISTORTION, LENS):
-        if not own.keys().isdisjoint(group) or (group is DISTORTION and other_lens):
+    other_model = any(key in own and own[key] != shared.get(key, False) for key in CAMERA_MODEL)
+    for group in (FOCAL, CENTRE, DISTORTION, CAMERA_MODEL):
+        if not own.keys().isdisjoint(group) or (group is DISTORTION and other_model):
             shared = {key: value for key, value in shared.items() if key not in group}
     return shared | own
 
@@ -72,8 +72,8 @@ def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: f
     ``distortion_params``, and ``camera_model``; a focal length across one side serves for both. ``width``, ``height``
     (pixels) and ``focal`` (in longer sides of the picture; 0 for unknown) stand where the file has none.
 
-    Raises ValueError, saying what is wrong, for numbers that are not finite, for what no lens or crop could have, and
-    for lenses that are not known here.
+    Raises ValueError, saying what is wrong, for numbers that are not finite, for what no camera or crop could have, and
+    for camera models that are not known here.
     """
     declared = _declared(values)
     values = _with_named_terms(values)
@@ -100,7 +100,7 @@ def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: f
 
 
 def why_unusable(camera: Camera) -> str | None:
-    """What is wrong with intrinsics that no lens and no crop could have."""
+    """What is wrong with intrinsics that no camera and no crop could have."""
     if camera.model == PANORAMA:
         return NO_PANORAMAS
     if not np.isfinite(camera.params).all():
@@ -111,8 +111,8 @@ def why_unusable(camera: Camera) -> str | None:
         pixels = " × ".join(f"{value:.5g}" for value in focal)
         return f"a focal length of {pixels} pixels is not one for a picture of {camera.width}×{camera.height}"
     if max(map(abs, centre), default=0.0) > MAX_CENTRE_OFFSET * longer:
-        place = ", ".join(f"{value:.5g}" for value in centre)
-        return f"its principal point ({place}) is far outside of its {camera.width}×{camera.height} pixels"
+        at = ", ".join(f"{value:.5g}" for value in centre)
+        return f"its principal point ({at}) is far outside of its {camera.width}×{camera.height} pixels"
     return None
 
 
@@ -129,15 +129,15 @@ def _with_named_terms(values: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _declared(values: Mapping[str, Any]) -> str:
-    """The lens that the values declare, "" without; one of PERSPECTIVES or FISHEYES."""
+    """The camera model that the values declare, "" without; one of PERSPECTIVES or FISHEYES."""
     declared = values.get("camera_model") or ""
     if declared == PANORAMA:
         raise ValueError(NO_PANORAMAS)
     if declared not in PERSPECTIVES + FISHEYES:
         known = ", ".join((*PERSPECTIVES[1:], *FISHEYES))
         raise ValueError(f"its camera_model is {repr(declared)[:MAX_LETTERS]}, which is none of {known}")
-    if other := next((key for key in OTHER_LENSES if values.get(key, False) is not False), None):
-        raise ValueError(f"it has {other}: lenses of that kind are not supported")
+    if other := next((key for key in OTHER_CAMERA_MODELS if values.get(key, False) is not False), None):
+        raise ValueError(f"it has {other}: camera models of that kind are not supported")
     return FISHEYE if values.get("is_fisheye") and declared not in FISHEYES else declared
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-FARTHEST = 0.7 * 512  # a match lies nearer than this: COLMAP's max_distance, and its length of a SIFT descriptor
+MAX_DISTANCE = 0.7 * 512  # a match lies nearer than this: COLMAP's max_distance, and its length of a SIFT descriptor
 BLOCK = 64  # rows of the matrix of distances at a time: they stay in the cache
 PROBES = 4  # cells of the vocabulary that a feature is compared in, of 32: 97.6 % of the matches, 98.0 % of the inliers
 
@@ -66,7 +66,7 @@ def _is_distinct(
     """Whether the nearest is near, and much nearer than the second; both are given as q·b − |b|²/2."""
     squares = 2 * half_squares.astype(float)
     best_squared, second_squared = squares - 2 * best.astype(float), squares - 2 * second.astype(float)
-    return (best_squared < max_ratio**2 * second_squared) & (best_squared < FARTHEST**2)
+    return (best_squared < max_ratio**2 * second_squared) & (best_squared < MAX_DISTANCE**2)
 
 
 def _half_squares(descriptors: Float[np.ndarray, "n 128"]) -> Float[np.ndarray, "n 1"]:

@@ -11,16 +11,13 @@ from jaxtyping import Float, Int
 
 from nerf.geometry.georeference import GPS_ERROR_M, cartesian
 from stages.io.photos import Photo
-from stages.sfm.pairs import Matcher
+from stages.sfm.pairs import MAX_EXHAUSTIVE, Matcher
 
 Pairs = Int[np.ndarray, "pairs 2"]
 SimilarityMatrix = Float[np.ndarray, "photos photos"]
 
-# Matching every pair misses nothing, but most pairs of many photos show nothing in common. On sets of up to so many it
-# is done, exactly; on larger ones the match graph is grown (match_graph.py).
-MAX_EXHAUSTIVE = 50
-MUTUAL = 0.9  # of a photo's partners, about so many count it among their own
-LOOPS = 5  # in a sequence one of so many partners is looked for at other times
+MUTUAL_FRACTION = 0.9  # of a photo's partners, about so many count it among their own
+LOOP_INTERVAL = 5  # in a sequence one of so many partners is chosen for loop closure, at other times
 
 
 class CapturePriors(NamedTuple):
@@ -87,9 +84,9 @@ def spanning_tree(similarity: SimilarityMatrix) -> Pairs:
 
 
 def spatial(position_m: Float[np.ndarray, "photos 3"], similarity: SimilarityMatrix, neighbours: int) -> Pairs:
-    """Each photo with its ``neighbours``: half of them nearest by place, the others its most similar among the rest.
+    """Each photo with its ``neighbours``: half of them nearest by position, the others its most similar among the rest.
 
-    Positions may be off by more than photos are apart, or the same for dozens of them: looks make up for that.
+    Positions may be off by more than photos are apart, or the same for dozens of them: similarity makes up for that.
     """
     near = nearest(closeness(position_m), neighbours // 2)
     rest = similarity.astype(float)
@@ -109,7 +106,7 @@ def closeness(position_m: Float[np.ndarray, "n 3"]) -> SimilarityMatrix:
 
 
 def start_pairs(
-    matcher: Matcher, neighbours: int, count: int, places: CapturePriors, similarity: Callable[[], SimilarityMatrix]
+    matcher: Matcher, neighbours: int, count: int, priors: CapturePriors, similarity: Callable[[], SimilarityMatrix]
 ) -> Pairs:
     """The pairs that matching begins with. ``similarity`` is asked for only where it is needed.
 
@@ -121,10 +118,10 @@ def start_pairs(
     if matcher == "retrieval":
         return union(nearest(similarity(), max(2, neighbours // 4)), spanning_tree(similarity()))
     if matcher == "spatial":
-        assert places.position_m is not None
-        return spatial(places.position_m, similarity(), neighbours)
-    order = np.arange(count) if places.time_s is None else np.argsort(places.time_s, kind="stable")
-    loops = max(1, neighbours // LOOPS)
+        assert priors.position_m is not None
+        return spatial(priors.position_m, similarity(), neighbours)
+    order = np.arange(count) if priors.time_s is None else np.argsort(priors.time_s, kind="stable")
+    loops = max(1, neighbours // LOOP_INTERVAL)
     overlap = max(1, (neighbours - loops) // 2)
     when = np.argsort(order)
     apart = np.abs(when[:, None] - when[None]) > overlap
@@ -151,16 +148,20 @@ def second_look(
 def expected_pairs(matcher: Matcher, count: int, neighbours: int) -> int:
     """About how many pairs there will be."""
     everything = count * (count - 1) // 2
-    return everything if matcher == "exhaustive" else min(everything, round(count * neighbours * (1 - MUTUAL / 2)))
+    return (
+        everything
+        if matcher == "exhaustive"
+        else min(everything, round(count * neighbours * (1 - MUTUAL_FRACTION / 2)))
+    )
 
 
-def choose(count: int, neighbours: int, places: CapturePriors) -> Matcher:
-    """Every pair of a set of ordinary size; else by time, place or looks."""
+def choose(count: int, neighbours: int, priors: CapturePriors) -> Matcher:
+    """Every pair of a set of ordinary size; else by time, GPS position or similarity."""
     if count <= MAX_EXHAUSTIVE:
         return "exhaustive"
-    if places.time_s is not None:
+    if priors.time_s is not None:
         return "sequential"
-    if places.position_m is not None and _is_spread_out(places.position_m, neighbours):
+    if priors.position_m is not None and _is_spread_out(priors.position_m, neighbours):
         return "spatial"
     return "retrieval"
 

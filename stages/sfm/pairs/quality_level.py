@@ -1,4 +1,4 @@
-"""How far to search features and which pairs of photos to match, decided beforehand.
+"""How features are extracted and which pairs of photos are matched, decided beforehand.
 
 The cost is measured on a few of the photos, in a child process (COLMAP may abort): ``python -P -m
 stages.sfm.pairs.quality_level`` reads a job from stdin as one line of JSON and answers with a :class:`Cost`.
@@ -43,17 +43,19 @@ WAYS = {
 }
 
 
-# The accuracy in docs/results.md is that of the first tier. Sets of any size are searched so: features left out cost
-# more in cameras than they save in seconds. Only where a time is given that would not be enough, they give way: a step
-# down has half the pixels or the same, and a quarter of the products of matching. Below 1131 pixels photos would have
-# to be doubled to yield enough, which saves nothing.
-SEARCHING = 0.55  # of the seconds given to structure from motion: mapping and adjusting take the rest
-DENSEST = (0.5, 0.08)  # seconds of a photo and of a pair, two cores, of photos with the most features (fountain_p11)
-WORTH_IT = 0.7  # of the time: small photos, or such with few features, gain nothing by a step down, and are spared it
+# The accuracy in docs/results.md is that of the first level. Sets of any size have it: features left out cost more in
+# cameras than they save in seconds. Only where a time is given that would not be enough is it lowered: the next level
+# has half the pixels or the same, and a quarter of the comparisons in matching. Below 1131 pixels photos would have to
+# be doubled to yield enough, which saves nothing.
+MATCHING_FRACTION = 0.55  # of the seconds given to structure from motion, for features too; mapping takes the rest
+MAX_COST = (0.5, 0.08)  # seconds of a photo and of a pair, two cores, of photos with the most features (fountain_p11)
+MAX_TIME_RATIO = (
+    0.7  # of a level to the one above: small photos, or such with few features, gain nothing by a lower one
+)
 
 
 class QualityLevel(NamedTuple):
-    """How far features are searched: the longer side of photos in pixels, and how many each has at most."""
+    """How features are extracted: the longer side of photos in pixels, and how many each has at most."""
 
     max_image_size: int
     max_features: int
@@ -62,15 +64,15 @@ class QualityLevel(NamedTuple):
 QUALITY_LEVELS = (QualityLevel(1600, 4096), QualityLevel(1131, 2048), QualityLevel(1131, 1024))
 
 
-class Open(NamedTuple):
-    """What the user says of the search; None is left open."""
+class GivenOptions(NamedTuple):
+    """The user's options for extraction and matching; None is left open."""
 
     max_image_size: int | None
     max_features: int | None
     matcher: Matcher | None
 
 
-class Chosen(NamedTuple):
+class ChosenOptions(NamedTuple):
     """The same, with every answer."""
 
     max_image_size: int
@@ -89,89 +91,87 @@ class Cost(NamedTuple):
         return photos * self.per_photo + pairs * self.per_pair
 
 
-def check_matcher(matcher: Matcher | None, places: CapturePriors) -> None:
+def check_matcher(matcher: Matcher | None, priors: CapturePriors) -> None:
     """Raises StageError where a matcher was asked for that the photos do not allow."""
-    if matcher == "spatial" and places.position_m is None:
+    if matcher == "spatial" and priors.position_m is None:
         raise StageError(
             "sfm.no-positions",
-            "cannot choose pairs of photos by place",
+            "cannot select pairs of photos by GPS position",
             "not all photos tell by EXIF where they were taken",
             "Leave out --sfm.matcher, or try --sfm.matcher retrieval.",
         )
 
 
 def chosen(
-    left_open: Open,
+    given: GivenOptions,
     photos: Sequence[Photo],
     images: Path,
     neighbours: int,
     progress: Progress,
     seconds_given: float | None,
-) -> Chosen:
+) -> ChosenOptions:
     """What is left open: the pairs by how many photos there are, and features in full, unless ``seconds_given`` to all
     of structure from motion would not be enough for them. Then some photos are timed on this machine, which is said.
     """
-    count, tiers = len(photos), quality_levels(left_open)
-    matcher = left_open.matcher or choose(count, neighbours, capture_priors(photos))
+    count, levels = len(photos), quality_levels(given)
+    matcher = given.matcher or choose(count, neighbours, capture_priors(photos))
     pairs = expected_pairs(matcher, count, neighbours)
     if matcher != "exhaustive":
         everything = expected_pairs("exhaustive", count, neighbours)
         progress.note(f"{count} photos have {everything:,} pairs: {WAYS[matcher].format(neighbours)}, about {pairs:,}")
-    if seconds_given is None or len(tiers) == 1 or _at_most(count, pairs) <= SEARCHING * seconds_given:
-        return Chosen(*tiers[0], matcher)
+    if seconds_given is None or len(levels) == 1 or _max_seconds(count, pairs) <= MATCHING_FRACTION * seconds_given:
+        return ChosenOptions(*levels[0], matcher)
     progress.update("measuring what features and matches of a few photos take")
-    tier, full = tiers[0], _measured(photos, images, tiers[0], matcher).of(count, pairs)
+    level, full = levels[0], _measured(photos, images, levels[0], matcher).of(count, pairs)
     seconds = full
-    for less in tiers[1:]:
-        if seconds <= SEARCHING * seconds_given:
+    for less in levels[1:]:
+        if seconds <= MATCHING_FRACTION * seconds_given:
             break
-        if (shorter := _measured(photos, images, less, matcher).of(count, pairs)) <= WORTH_IT * seconds:
-            tier, seconds = less, shorter
-    progress.note(_search_in_words(count, tiers[0], tier, full, seconds))
-    return Chosen(*tier, matcher)
+        if (shorter := _measured(photos, images, less, matcher).of(count, pairs)) <= MAX_TIME_RATIO * seconds:
+            level, seconds = less, shorter
+    progress.note(_level_message(count, levels[0], level, full, seconds))
+    return ChosenOptions(*level, matcher)
 
 
-def _at_most(count: int, pairs: int) -> float:
+def _max_seconds(count: int, pairs: int) -> float:
     """Seconds that features and pairs take at most, before any is measured."""
-    return Cost(*DENSEST).of(count, pairs) * max(1.0, 2 / processors())
+    return Cost(*MAX_COST).of(count, pairs) * max(1.0, 2 / processors())
 
 
-def quality_levels(left_open: Open) -> list[QualityLevel]:
-    """The tiers to choose from, what is given in all of them."""
-    size, features = left_open.max_image_size, left_open.max_features
+def quality_levels(given: GivenOptions) -> list[QualityLevel]:
+    """The levels to choose from; what is given holds in all of them."""
+    size, features = given.max_image_size, given.max_features
     return list(
         dict.fromkeys(
-            QualityLevel(size or tier.max_image_size, features or tier.max_features) for tier in QUALITY_LEVELS
+            QualityLevel(size or level.max_image_size, features or level.max_features) for level in QUALITY_LEVELS
         )
     )
 
 
-def _search_in_words(count: int, full: QualityLevel, tier: QualityLevel, seconds_full: float, seconds: float) -> str:
-    if tier == full:
-        return f"{count} photos searched at {_in_words(tier)} and matched: about {rough_duration(seconds)}"
-    instead = f"at {_in_words(tier)} instead, about {rough_duration(seconds)}"
-    return (
-        f"{count} photos searched at {_in_words(full)} and matched take about {rough_duration(seconds_full)}: {instead}"
-    )
+def _level_message(count: int, full: QualityLevel, level: QualityLevel, seconds_full: float, seconds: float) -> str:
+    said = f"features and matches of {count} photos take about {rough_duration(seconds_full)} with {_describe(full)}"
+    if level == full:
+        return said
+    return f"{said}, about {rough_duration(seconds)} with {_describe(level)}: these are used"
 
 
-def _in_words(tier: QualityLevel) -> str:
-    return f"{tier.max_image_size} pixels for {tier.max_features} features"
+def _describe(level: QualityLevel) -> str:
+    return f"{level.max_features} features a photo at {level.max_image_size} pixels"
 
 
-def _measured(photos: Sequence[Photo], images: Path, tier: QualityLevel, matcher: Matcher) -> Cost:
+def _measured(photos: Sequence[Photo], images: Path, level: QualityLevel, matcher: Matcher) -> Cost:
     """Measured in a child process, all cores at work. Raises StageError where it does not end well."""
     some = [asdict(photo) for photo in _sample(photos, processors())]
     indexed = matcher != "exhaustive"
-    job = json.dumps({"images": str(images.absolute()), "photos": some, "indexed": indexed, **tier._asdict()})
+    job = json.dumps({"images": str(images.absolute()), "photos": some, "indexed": indexed, **level._asdict()})
     answer = subprocess.run(
         [sys.executable, *COMMAND], input=job.encode(), capture_output=True, env=environment(), start_new_session=True
     )
     if answer.returncode:
         lines = answer.stderr.decode("utf-8", "replace").strip().splitlines()
         why = lines[-1] if lines else f"COLMAP ended with {answer.returncode}"
-        every = f"--sfm.matcher exhaustive --sfm.max-image-size {tier.max_image_size}"
-        hint = f"Say how, and nothing is measured: {every} --sfm.max-features {tier.max_features}."
+        every = f"--sfm.matcher exhaustive --sfm.max-image-size {level.max_image_size}"
+        hint = f"Say how, and nothing is measured: {every} --sfm.max-features {level.max_features}."
         raise StageError("sfm.not-measured", "could not measure what features and matches take", why, hint)
     return Cost(**json.loads(answer.stdout))
 

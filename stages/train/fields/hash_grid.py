@@ -14,7 +14,7 @@ from stages.hardware.backend import chosen_backend, load_backend
 from stages.hardware.device import compute_device, cores
 from stages.hardware.memory import available_on
 from stages.train.config import MAX_MICRO_BATCHES, Config
-from stages.train.data import has_background_model, training_background
+from stages.train.data import has_background_model, space_of, training_background
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
@@ -198,7 +198,7 @@ def field_settings(config: Config, sky: bool) -> HashGridSettings:
         log2_hashmap_size=config.log2_rows,
         base_res=min(BASE_RES[config.space], config.finest),
         max_res=config.finest,
-        contracted=config.contracted,
+        space=space_of(config),
         diagonal_steps=max(1, round(config.ray_samples * min(math.sqrt(3) * config.finest, MAX_STEPS))),
         min_step_size=shortest,
         cone_angle=shortest / EVEN_UNTIL,

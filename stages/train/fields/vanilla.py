@@ -9,7 +9,7 @@ from nerf.training.vanilla_trainer import CHUNK_RAYS, VanillaTrainer, VanillaTra
 from stages.contract import Progress
 from stages.hardware.device import cores
 from stages.train.config import Config
-from stages.train.data import training_background
+from stages.train.data import space_of, training_background
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
@@ -133,4 +133,5 @@ def make_trainer(
 
 def field_settings(config: Config) -> VanillaSettings:
     """Sizes and ablations of the field."""
-    return VanillaSettings(**{part.name: getattr(config, part.name) for part in fields(VanillaSettings)})
+    of_config = {part.name: getattr(config, part.name) for part in fields(VanillaSettings) if part.name != "space"}
+    return VanillaSettings(**of_config, space=space_of(config))

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from nerf.effects import ImageEffects, RayGradients, RenderedRays, TrainingImages
+from nerf.effects import HeldOutImages, ImageEffects, Images, RayGradients, RenderedRays
 from nerf.effects.exposure import ExposureModel, expose
 from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.interface import Rendering
@@ -23,8 +23,8 @@ def rays() -> Rays:
     return Rays(drawn(2, 5, 3), directions, torch.ones(5).double(), torch.full((5,), 5.0).double())
 
 
-def images() -> TrainingImages:
-    return TrainingImages(torch.cat([torch.eye(3).repeat(3, 1, 1), drawn(3, 3, 3, 1)], dim=2).double())
+def images() -> Images:
+    return Images(torch.cat([torch.eye(3).repeat(3, 1, 1), drawn(3, 3, 3, 1)], dim=2).double())
 
 
 def colours() -> ImageEffects:
@@ -41,7 +41,7 @@ def refined(*seeds: int) -> ImageEffects:
         pose = PoseRefinement(drawn(6, 3, 3))
         pose.turn += 0.3 * drawn(seed, 3, 3)
         pose.offset += 0.3 * drawn(seed + 1, 3, 3)
-        pose.name = f"pose_{seed}"
+        vars(pose)["name"] = f"pose_{seed}"
         effects.append(pose)
     return ImageEffects(tuple(effects))
 
@@ -109,7 +109,8 @@ def test_without_ray_effects_no_gradient_of_rays_is_computed() -> None:
 
 def test_held_out_images_get_what_their_neighbours_have() -> None:
     weights = torch.tensor([[0.25, 0.75, 0.0]]).double()
-    held_out, trained = colours().of_held_out(weights), colours()
+    unseen = HeldOutImages(Images(images().scene_from_camera[:1]), weights)
+    held_out, trained = colours().of_held_out(unseen), colours()
     for name, rows in held_out.parameters.items():
         torch.testing.assert_close(rows, weights @ trained.parameters[name])
-    assert not refined(8).of_held_out(weights).rays
+    assert not refined(8).of_held_out(unseen).rays

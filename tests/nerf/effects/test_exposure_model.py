@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from nerf.effects import NO_EFFECTS, ColourEffect, ImageEffects, RayEffect, RenderedRays, TrainingImages
+from nerf.effects import NO_EFFECTS, ColourEffect, ImageEffects, Images, RayEffect, RenderedRays
 from nerf.effects.exposure import ExposureModel, expose
 from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.interface import Rendering
@@ -99,7 +99,7 @@ def test_extremes_are_finite_in_value_and_gradient(log_gain: float, kind: torch.
 
 
 def test_the_mean_gain_is_kept_by_the_gauge() -> None:
-    part = ExposureModel.initial(TrainingImages(torch.zeros(3, 3, 4)), GAINS)
+    part = ExposureModel.initial(Images(torch.zeros(3, 3, 4)), GAINS)
     assert torch.equal(part.log_gain.amin(0), torch.zeros(3).double())
     torch.testing.assert_close(part.log_gain - part.log_gain[:1], GAINS - GAINS[:1])
     before = part.log_gain.mean(0).clone()
@@ -111,6 +111,6 @@ def test_the_mean_gain_is_kept_by_the_gauge() -> None:
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_the_reference_exposure_is_that_of_a_usual_photo(count: int) -> None:
     gains = torch.linspace(0, 1, count)[:, None].repeat(1, 3)
-    reference = ExposureModel(gains).reference
+    (reference,) = ExposureModel.of_new_view(gains).rows
     assert (gains.min(0).values <= reference).all() and (reference <= gains.max(0).values).all()
     assert abs(float(reference[0]) - 0.5) <= 0.5 / max(1, count - 1) + (count == 1) * 0.5

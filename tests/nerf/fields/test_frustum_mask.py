@@ -12,6 +12,7 @@ from nerf.fields.frustum_mask import compute_frustum_mask
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.contraction import uncontract
 from nerf.geometry.near_far import NEAR_MARGIN
+from nerf.geometry.space_maps import Box, Contraction, SpaceMap
 from nerf.kernels import CONTRACTED_BOX
 from nerf.kernels import torch as reference
 from nerf.kernels.torch.marching import unit_coordinates
@@ -28,7 +29,7 @@ FIELD = HashGridSettings(
     max_res=16,
     diagonal_steps=32,
     occupancy_resolution=16,
-    contracted=True,
+    space=Contraction(),
 )
 TRAINER = HashGridTrainerSettings(seed=3, background=(0.0, 0.0, 0.0), samples=1024, least_photos=3)
 
@@ -75,7 +76,7 @@ def projected(views: RayDataset, points: torch.Tensor, near: float, half: float)
 @pytest.mark.parametrize("least", [1, 2, 3, 4])
 def test_a_cell_needs_enough_photos_or_a_foreground(half: float, least: int) -> None:
     views = dataset(half=half)
-    usable, points = compute_frustum_mask(views, least, 64), middles(64)
+    usable, points = compute_frustum_mask(views, Contraction(), least, 64), middles(64)
     photos = projected(views, points, NEAR, half)
     wanted = (photos >= least) | (projected(views, points, NEAR / NEAR_MARGIN, half) > 0)
     assert usable[wanted].all(), "none is overlooked, however wide the lens"
@@ -95,7 +96,7 @@ def test_photos_together_find_what_each_finds(monkeypatch: pytest.MonkeyPatch) -
         for count, together in ((1, 1), (2, 2), (2, 16)):
             torch.set_num_threads(count)
             monkeypatch.setattr(frustum_mask, "TOGETHER", together)
-            found.append(compute_frustum_mask(dataset(5, 0.15), 3, 64))
+            found.append(compute_frustum_mask(dataset(5, 0.15), Contraction(), 3, 64))
     finally:
         torch.set_num_threads(threads)
     assert 0 < found[0].float().mean() < 1
@@ -116,14 +117,14 @@ def test_all_trainers_of_a_bank_ask_once(monkeypatch: pytest.MonkeyPatch) -> Non
     for field in fields:
         HashGridTrainer(field, views, TRAINER)
     assert asked == [0, 1, 2, 3] and torch.equal(fields[0].occupancy_bits, fields[1].occupancy_bits)
-    compute_frustum_mask(dataset(), 3, 16)
-    compute_frustum_mask(views, 2, 16)
+    compute_frustum_mask(dataset(), Contraction(), 3, 16)
+    compute_frustum_mask(views, Contraction(), 2, 16)
     assert len(asked) == 12, "another dataset, and another question"
 
 
 def test_space_before_one_photos_foreground_is_left_empty() -> None:
     along = torch.tensor([[2.5 - t, 0.0, 0.0] for t in (-3.0, 0.4, 1.2, 1.7, 2.5, 20.0)])
-    usable = compute_frustum_mask(dataset(2), 2, 64)
+    usable = compute_frustum_mask(dataset(2), Contraction(), 2, 64)
     numbers = cell_numbers(64, unit_coordinates(along, True)).long()
     assert usable[numbers].tolist() == [False, False, False, True, True, True]
 
@@ -132,7 +133,7 @@ def test_nothing_is_ever_sampled_elsewhere_nor_found_there() -> None:
     field = HashGridField(FIELD, 0, reference)
     views = knowing(dataset(4, 0.15))
     trainer = HashGridTrainer(field, views, TRAINER)
-    usable = compute_frustum_mask(views, 3, 16)
+    usable = compute_frustum_mask(views, Contraction(), 3, 16)
     assert 0.02 < usable.float().mean() < 0.98
     numbers = torch.arange(16**3, dtype=torch.int32)
     for step in range(40):
@@ -144,16 +145,16 @@ def test_nothing_is_ever_sampled_elsewhere_nor_found_there() -> None:
 
 
 @pytest.mark.parametrize(
-    ("views", "contracted", "least"),
+    ("views", "space", "least"),
     [
-        (knowing(dataset(2)), True, 3),
-        (dataset(), True, 3),
-        (knowing(dataset()), False, 3),
-        (knowing(dataset()), True, 1),
+        (knowing(dataset(2)), Contraction(), 3),
+        (dataset(), Contraction(), 3),
+        (knowing(dataset()), Box(), 3),
+        (knowing(dataset()), Contraction(), 1),
     ],
     ids=["two photos", "no points", "a box", "one is enough"],
 )
-def test_where_the_rule_says_nothing_all_of_space_is_used(views: RayDataset, contracted: bool, least: int) -> None:
-    field = HashGridField(replace(FIELD, contracted=contracted), 0, reference)
+def test_where_the_rule_says_nothing_all_of_space_is_used(views: RayDataset, space: SpaceMap, least: int) -> None:
+    field = HashGridField(replace(FIELD, space=space), 0, reference)
     HashGridTrainer(field, views, replace(TRAINER, least_photos=least))
     assert (field.occupancy_bits == -1).all()

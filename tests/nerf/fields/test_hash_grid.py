@@ -10,6 +10,7 @@ from nerf.fields.background import BACKGROUND_LAYOUT, background_colour
 from nerf.fields.hash_grid import THINNING_THRESHOLD, HashGridField, HashGridSettings
 from nerf.fields.interface import RadianceModel, Rendering
 from nerf.geometry.rays import Rays
+from nerf.geometry.space_maps import Contraction, Ndc
 from nerf.kernels import Backend, GridLayout, RayStepping, Samples, warp
 from nerf.kernels import torch as reference
 from nerf.kernels.torch.occupancy import binary_occupancy
@@ -18,9 +19,12 @@ from nerf.rendering.early_termination import EARLY_STOP_TRANSMITTANCE
 SMALL = HashGridSettings(
     num_levels=2, log2_hashmap_size=9, base_res=3, max_res=9, diagonal_steps=24, occupancy_resolution=8
 )
-FOLDED = replace(SMALL, contracted=True, min_step_size=0.1, cone_angle=0.2)
+FOLDED = replace(SMALL, space=Contraction(), min_step_size=0.1, cone_angle=0.2)
 OUTDOORS = replace(FOLDED, background_model=True)
 DIFFUSE = replace(SMALL, view_dependence=False)
+FORWARD = replace(
+    OUTDOORS, space=Ndc((0.1, -1.5, 0.0), ((0.96, 0.28, 0.0), (0.0, 0.0, -1.0), (-0.28, 0.96, 0.0)), (1.2, 1.4), 0.4)
+)
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["reference", "warp"])
 
 
@@ -45,11 +49,13 @@ def rays(count: int = 6) -> Rays:
 
 def seen_by_autograd(model: HashGridField, given: Rays, jitter: Tensor, background: Tensor) -> Tensor:
     """The loss sum(colour * k) + sum(depth) written with plain torch, differentiable in parameters and rays."""
-    settings = model.settings
-    samples = reference.march(
-        binary_occupancy(model.occupancy_bits), model.stepping, given.each(lambda part: part.detach()), jitter
-    )
-    points = reference.sample_points(given, samples, settings.contracted)
+    settings, space = model.settings, model.space
+    mapped = space.map_rays(given.each(lambda part: part.detach()))
+    samples = reference.march(binary_occupancy(model.occupancy_bits), model.stepping, mapped.rays, jitter)
+    lengths = samples.dt * mapped.scene_length(samples.t, samples.ray)
+    samples = samples._replace(t=mapped.to_scene(samples.t, samples.ray), dt=lengths)
+    points = space.forward(given.origins[samples.ray] + samples.t[:, None] * given.directions[samples.ray])
+    points = (points + space.half) / (2 * space.half)
     features = encoded_by_autograd(model.layout, model.table, points)
     if settings.background_model:
         on_sphere = encoded_by_autograd(BACKGROUND_LAYOUT, model.background_table, (given.directions + 1) / 2)
@@ -84,7 +90,7 @@ def encoded_by_autograd(layout: GridLayout, table: Tensor, points: Tensor) -> Te
     return torch.cat(features, -1)
 
 
-@pytest.mark.parametrize("settings", [SMALL, FOLDED, OUTDOORS, DIFFUSE])
+@pytest.mark.parametrize("settings", [SMALL, FOLDED, OUTDOORS, DIFFUSE, FORWARD])
 def test_all_gradients_are_those_of_autograd(settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nerf.fields.hash_grid.THINNING_THRESHOLD", 0.0)
     monkeypatch.setattr(mlp, "BLOCK", {"cpu": 7})  # so that there are several, the last one short
@@ -287,7 +293,7 @@ def in_one_pass(
 ) -> tuple[int, Samples, Rendering]:
     """How many samples stand in occupied cells, those that can be seen, and what rays see; no rounds."""
     samples = reference.march(binary_occupancy(model.occupancy_bits), stepping, given, jitter)
-    density = model._density_pass(reference.sample_points(given, samples, model.settings.contracted))
+    density = model._density_pass(reference.sample_points(given, samples, model.space.bends_rays))
     front, seen = reference.visible_samples(samples, density.sigma, EARLY_STOP_TRANSMITTANCE, thin, jitter)
     of_rays = mlp.ray_hidden(model.weights, reference.spherical_harmonics(given.directions))
     colour = mlp.colour_forward(model.weights, reference, front, density.geometry[seen], of_rays).colour

@@ -10,16 +10,19 @@ import torch
 from nerf.fields.interface import Rendering
 from nerf.fields.vanilla import BOX, SOFTPLUS_SHIFT, VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
+from nerf.geometry.space_maps import Box, Contraction, Ndc, SpaceMap, space_map
 from nerf.runtime.randomness import generator
 from tests.reference import paper_loop
 
 SMALL = VanillaSettings(
     depth=3, width=6, skip=0, position_frequencies=3, direction_frequencies=2, samples_coarse=4, samples_fine=5
 )
+FORWARD = Ndc((0.1, -1.5, 0.0), ((0.96, 0.28, 0.0), (0.0, 0.0, -1.0), (-0.28, 0.96, 0.0)), (1.2, 1.4), 0.4)
 VARIANTS = {
     "as published": {"density_activation": "relu"},
     "softplus": {},
-    "contracted": {"contracted": True, "spacing": "log"},
+    "contracted": {"space": Contraction(), "spacing": "log"},
+    "forward-facing": {"space": FORWARD},
     "no view dependence": {"view_dependence": False},
     "no positional encoding": {"positional_encoding": False},
     "no hierarchical sampling": {"hierarchical": False},
@@ -93,7 +96,7 @@ def test_float64_agrees_with_the_slow_loop(variant: str) -> None:
     with torch.no_grad():
         renderings = model.render_training(rays, BACKGROUND, None)
     assert renderings[1].opacity.max() > 0.2
-    assert (renderings[1].opacity.min() == 0) != settings.contracted  # some rays miss the box
+    assert (renderings[1].opacity.min() == 0) != settings.space.bends_rays  # some rays miss the box
     expected = slow(weights_of(model), settings, rays)
     assert difference(renderings, expected) < 1e-9
     only_fine = model.render(rays, BACKGROUND)
@@ -112,16 +115,16 @@ def test_random_samples_agree_with_the_slow_loop() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize("space", [Box(), Contraction()], ids=["box", "contraction"])
 @pytest.mark.parametrize(
     "settings",
     [VanillaSettings(width=16), VanillaSettings(depth=4, width=64, samples_coarse=32, samples_fine=32)],
     ids=["narrow", "shallow"],
 )
 def test_float32_agrees_with_the_slow_loop_at_the_published_frequencies(
-    settings: VanillaSettings, contracted: bool, seed: int
+    settings: VanillaSettings, space: SpaceMap, seed: int
 ) -> None:
-    settings = dataclasses.replace(settings, contracted=contracted)
+    settings = dataclasses.replace(settings, space=space)
     model, rays = VanillaNerf(settings, seed), rays_at(0.8 + 0.1 * seed, 2, torch.float32)
     with torch.no_grad():
         renderings = model.render_training(rays, BACKGROUND.float(), None)
@@ -222,15 +225,15 @@ def test_density_is_independent_of_direction_and_zero_outside_the_box() -> None:
 
 
 def test_a_contracted_field_fills_all_of_space() -> None:
-    model = VanillaNerf(dataclasses.replace(SMALL, contracted=True, spacing="log"), 0)
+    model = VanillaNerf(dataclasses.replace(SMALL, space=Contraction(), spacing="log"), 0)
     sigma = model.density(torch.tensor([[0.3, 0.1, 0.1], [2.3, 0.1, 0.1], [1e4, 0.0, 0.0], [1e30, 0.0, 0.0]]))
     assert torch.isfinite(sigma).all() and (sigma > 0).all()
     assert sigma[0] != sigma[1]
 
 
-@pytest.mark.parametrize("contracted", [False, True])
-def test_a_fresh_field_is_neither_empty_nor_opaque(contracted: bool) -> None:
-    settings = VanillaSettings(depth=4, width=64, samples_coarse=16, samples_fine=16, contracted=contracted)
+@pytest.mark.parametrize("space", [Box(), Contraction()], ids=["box", "contraction"])
+def test_a_fresh_field_is_neither_empty_nor_opaque(space: SpaceMap) -> None:
+    settings = VanillaSettings(depth=4, width=64, samples_coarse=16, samples_fine=16, space=space)
     for seed in range(3):
         opacity = VanillaNerf(settings, seed).render(rays_at(0.5, 64, torch.float32), torch.ones(3)).opacity
         assert 0.05 < opacity.mean() < 0.95
@@ -285,8 +288,9 @@ def test_a_weight_that_is_not_a_number_is_not_hidden(net: str) -> None:
 
 
 def test_settings_survive_json() -> None:
-    settings = dataclasses.replace(SMALL, contracted=True, spacing="log", density_activation="relu")
-    assert VanillaSettings(**json.loads(json.dumps(dataclasses.asdict(settings)))) == settings
+    settings = dataclasses.replace(SMALL, space=Contraction(), spacing="log", density_activation="relu")
+    again = json.loads(json.dumps(dataclasses.asdict(settings)))
+    assert VanillaSettings(**again | {"space": space_map(**again["space"])}) == settings
 
 
 @pytest.mark.parametrize(

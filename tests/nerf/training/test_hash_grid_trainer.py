@@ -11,6 +11,7 @@ from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.background import background_colour
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.rays import Rays
+from nerf.geometry.space_maps import Contraction
 from nerf.kernels import torch as reference
 from nerf.training.hash_grid_trainer import (
     HashGridBatch,
@@ -191,7 +192,7 @@ def test_the_distortion_loss_begins_weak() -> None:
 def test_unbounded_scenes_train_too() -> None:
     run = trainer(
         replace(TRAINER, background=(0.0, 0.0, 0.0), distortion=1e-3),
-        replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1),
+        replace(FIELD, space=Contraction(), min_step_size=0.05, cone_angle=0.1),
     )
     results = [run.step(step, step / 60) for step in range(60)]
     first, last = (sum(r.psnr for r in part) / 10 for part in (results[:10], results[-10:]))
@@ -218,7 +219,7 @@ def test_a_state_of_equal_shapes_but_other_settings_is_refused() -> None:
 
 
 def test_unbounded_occupancy_has_finite_steps() -> None:
-    model = HashGridField(replace(FIELD, contracted=True), 0, reference)
+    model = HashGridField(replace(FIELD, space=Contraction()), 0, reference)
     cache = HashGridTrainer(model, small_dataset(), TRAINER).occupancy_grid
     cache.update(15, torch.Generator().manual_seed(1))
     assert cache.optical_thickness.isfinite().all()
@@ -308,7 +309,7 @@ def test_the_sky_becomes_what_is_seen_in_its_direction() -> None:
     dataset = small_dataset()
     colours = torch.tensor([[30, 60, 230], [240, 200, 30]], dtype=torch.uint8)
     dataset = dataset._replace(pixels=colours.repeat_interleave(len(dataset.pixels) // 2, 0))
-    outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1, background_model=True)
+    outdoors = replace(FIELD, space=Contraction(), min_step_size=0.05, cone_angle=0.1, background_model=True)
     run = HashGridTrainer(
         HashGridField(outdoors, 0, reference), dataset, replace(TRAINER, background=(0.0, 0.0, 0.0), rate=1e-2)
     )
@@ -374,7 +375,7 @@ def test_an_eighth_of_the_rays_run_to_points() -> None:
 
 def test_points_beyond_a_bounded_box_are_no_guide() -> None:
     dataset = small_dataset().with_sparse_depths(torch.tensor([78, 78]), torch.tensor([3.0, 4.5]))
-    outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1)
+    outdoors = replace(FIELD, space=Contraction(), min_step_size=0.05, cone_angle=0.1)
     for field, distances in {FIELD: [3.0], outdoors: [3.0, 4.5]}.items():
         kept = HashGridTrainer(HashGridField(field, 0, reference), dataset, TRAINER).dataset.distance
         assert kept is not None and kept.tolist() == distances
@@ -389,7 +390,7 @@ def test_without_a_weight_known_distances_change_nothing() -> None:
 
 def test_an_always_hidden_background_turns_grey(monkeypatch: pytest.MonkeyPatch) -> None:
     """Light of a millionth reaches it now and then; Adam alone would follow that anywhere."""
-    outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1, background_model=True)
+    outdoors = replace(FIELD, space=Contraction(), min_step_size=0.05, cone_angle=0.1, background_model=True)
     run = HashGridTrainer(
         HashGridField(outdoors, 0, reference), small_dataset(), replace(TRAINER, background=(0.0, 0.0, 0.0))
     )

@@ -81,9 +81,9 @@ def test_expected_sfm_time_is_roughly_right(set_of: Photos, measured: float) -> 
     assert sfm_seconds(set_of, 16) < sfm_seconds(set_of, 2)
 
 
-def test_known_cameras_take_no_time() -> None:
+def test_imported_poses_take_seconds() -> None:
     times = expected(Settings.model_validate({"sfm": {"cameras": Path("t.json")}}), Photos(50, 2.0))
-    assert times["sfm"] == 0.2 and set(times) == set(usual())
+    assert 1 < times["sfm"] < 10 and set(times) == set(usual())
     assert [stage for stage, seconds in times.items() if seconds is None] == ["train", "evaluate", "render", "mesh"]
 
 

@@ -1,4 +1,4 @@
-"""What a new effect costs: its model and statistic (tests/nerf/effects/falloff.py) and one entry of the list."""
+"""What a new effect costs: its model and statistic (tests/nerf/effects/veil.py) and one entry of the list."""
 
 import json
 from collections.abc import Iterator
@@ -8,24 +8,23 @@ from typing import Any
 import pytest
 import torch
 
+from nerf.effects.appearance import AppearanceModel
 from nerf.effects.exposure import ExposureModel
-from nerf.fields.hash_grid import HashGridField
-from nerf.kernels import torch as reference
-from nerf.training.hash_grid_trainer import HashGridTrainer
 from pipeline.cli.settings import Settings, with_effects
-from stages import effects
-from stages.effects.decisions import image_effects, read_decisions
+from stages import effects, evaluate, render, train
 from stages.effects.effect_list import EFFECTS, Effect, EffectParts
-from stages.io.files import read_scene
+from stages.effects.image_effects import photo_effects
+from stages.io.field_files import load_field
+from stages.io.files import read_json, read_scene
+from stages.render.renderer import load_renderer
+from stages.render.video import as_asked
 from stages.report.effects import effects_table
-from stages.train.data import guided_dataset
 from tests.effect_scenes import Effects, effect_scene
-from tests.nerf.effects import falloff
-from tests.nerf.effects.falloff import FalloffModel
-from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER
+from tests.nerf.effects import veil
+from tests.nerf.effects.veil import VeilModel
 from tests.synthetic_photos import Quiet
 
-ENTRY = Effect("falloff", "light falls off", lambda: EffectParts(falloff.statistic, colours=FalloffModel.initial))
+ENTRY = Effect("veil", "stray light lies over photos", lambda: EffectParts(veil.statistic, colours=VeilModel))
 
 
 @pytest.fixture
@@ -35,35 +34,71 @@ def listed() -> Iterator[None]:
     EFFECTS.remove(ENTRY)
 
 
-@pytest.mark.usefixtures("listed")
-def test_an_effect_is_one_file_and_one_entry(tmp_path: Path) -> None:
+@pytest.fixture
+def trained(listed: None, tmp_path: Path) -> dict[str, Path]:
+    """The folders of a scene after its effects were decided and a few steps of training."""
     inputs = effect_scene(tmp_path / "scene", Effects(exposure_ev=1.0, alpha=True), views=10)
-    config = with_effects(Settings(), ["falloff=on", "exposure=on"]).effects.model_copy(update={"pilots": 0})
-    (out := tmp_path / "effects").mkdir()
-    result = effects.run(config, inputs, out, Quiet())
-    table = json.loads((out / "effects.json").read_text("utf-8"))
-    assert table["falloff"]["on"] and table["falloff"]["statistic"] == 1.0 and "falloff on (" in result.line
-    rows: Any = effects_table(table)
-    assert "falloff" in [row["name"] for row in rows["rows"]]
+    inputs |= {name: tmp_path / name for name in ("effects", "train", "evaluate", "render")}
+    for name in ("effects", "train", "evaluate", "render"):
+        inputs[name].mkdir()
+    decide = with_effects(Settings(), ["veil=on", "exposure=on"]).effects.model_copy(update={"pilots": 0})
+    effects.run(decide, inputs, inputs["effects"], Quiet())
+    sizes: dict[str, Any] = {"levels": 2, "log2_rows": 8, "finest": 16, "batch_samples": 512}
+    train.run(train.Config(downscale=8.0, steps=5, **sizes), inputs, inputs["train"], Quiet())
+    return inputs
 
-    scene = read_scene(inputs["normalise"])
-    views, dataset = scene.of_split("train"), guided_dataset(inputs, scene, 4.0, Quiet())
-    made = image_effects(read_decisions(out), views, dataset)
-    assert [type(effect) for effect in made.colours] == [ExposureModel, FalloffModel] and not made.rays
-    trainer = HashGridTrainer(HashGridField(FIELD, 0, reference), dataset, TRAINER, made)
-    before = {name: part.clone() for name, part in made.parameters.items()}
-    for step in range(5):
-        trainer.step(step, step / 5)
-    moved = {name for name, part in made.parameters.items() if not torch.equal(part, before[name])}
-    assert moved == {"exposure.log_gain", "falloff.slope"} <= {name.removeprefix("image.") for name in trainer.state()}
-    held_out = trainer.effects.of_held_out(torch.full((1, len(views)), 1 / len(views)))
-    assert [len(rows) for rows in held_out.parameters.values()] == [1, 1]
+
+def test_an_effect_is_one_file_and_one_entry(trained: dict[str, Path]) -> None:
+    table = json.loads((trained["effects"] / "effects.json").read_text("utf-8"))
+    assert table["veil"]["on"] and table["veil"]["statistic"] == 1.0
+    rows: Any = effects_table(table)
+    assert "veil" in [row["name"] for row in rows["rows"]]
+
+    scene, field = read_scene(trained["normalise"]), read_json(trained["train"] / "field.json")
+    photos = {view.name for view in scene.of_split("train")}
+    assert list(field["effects"]) == ["exposure", "veil"]
+    assert all(set(learnt) == photos for learnt in field["effects"].values())
+    levels = [row[0] for row in field["effects"]["veil"].values()]
+    assert min(levels) == 0 < max(levels), "it was learnt, and its gauge is fixed"
+
+    shown, _ = load_field(trained["train"])
+    assert isinstance(shown, AppearanceModel)
+    assert [type(effect) for effect in shown.effects] == [ExposureModel, VeilModel]
+    assert shown.effects[1].rows.tolist() == [[0.0]], "a new view is as clear as the clearest photo"
+
+
+def test_photos_are_rendered_and_scored_through_a_new_effect(trained: dict[str, Path]) -> None:
+    scene, file = read_scene(trained["normalise"]), trained["train"] / "field.json"
+    field, test = read_json(file), scene.of_split("test")[0]
+    field["effects"]["veil"] = {name: [0.25] for name in field["effects"]["veil"]}
+    field["effects"]["veil"][scene.of_split("train")[0].name] = [0.0]
+    file.write_text(json.dumps(field))
+
+    _, level = photo_effects(field, scene, test)
+    assert 0 < float(level.rows) <= 0.25, "a test photo is veiled as its neighbours are"
+    chosen = evaluate.Config(downscale=8.0, photos=2)
+    evaluate.run(chosen, trained, trained["evaluate"], Quiet())
+    metrics = read_json(trained["evaluate"] / "metrics.json")
+    assert metrics["appearance"] == [ExposureModel.held_out_words, VeilModel.held_out_words]
+    without = {**field, "effects": {"exposure": field["effects"]["exposure"]}}
+    file.write_text(json.dumps(without))
+    (trained["evaluate"].parent / "plain").mkdir()
+    evaluate.run(chosen, trained, trained["evaluate"].parent / "plain", Quiet())
+    assert read_json(trained["evaluate"].parent / "plain" / "metrics.json")["psnr"] != metrics["psnr"]
+
+    file.write_text(json.dumps(field))
+    like = scene.of_split("train")[3].name
+    rendered = render.run(render.Config(frames=2, width=32, match_exposure=like), trained, trained["render"], Quiet())
+    assert rendered.facts["appearance"] == f"exposed like {like}"
+    as_photo, _ = as_asked(load_renderer(trained["train"]), like, trained["train"], scene, Quiet())
+    assert isinstance(as_photo.model, AppearanceModel)
+    assert torch.equal(as_photo.model.effects[1].rows, torch.tensor([[0.25]]))
 
 
 def test_a_new_effect_is_unknown_where_it_is_not_listed() -> None:
-    assert "falloff" not in [effect.name for effect in EFFECTS]
-    with pytest.raises(ValueError, match="there is no effect 'falloff'; there are: background, exposure"):
-        effects.Config(force={"falloff": "on"})
+    assert "veil" not in [effect.name for effect in EFFECTS]
+    with pytest.raises(ValueError, match="there is no effect 'veil'; there are: background, exposure"):
+        effects.Config(force={"veil": "on"})
 
 
 def test_every_listed_effect_has_its_parts() -> None:

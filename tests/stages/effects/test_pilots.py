@@ -10,7 +10,8 @@ from nerf.effects.exposure import expose
 from nerf.effects.pose_refinement import PoseRefinement, fit_pose
 from nerf.rendering.images import render_image
 from stages.effects import pilots
-from stages.effects.decisions import Decisions, expected_gains, told_by_neighbours
+from stages.effects.decisions import Decisions
+from stages.effects.image_effects import held_out_images, photo_effects
 from stages.effects.pilots import Pilot, PilotScene, pilot_scene, run_pilot
 from stages.io.files import read_scene
 from stages.io.pixels import load_pixels
@@ -66,7 +67,7 @@ def test_validation_poses_are_fitted_wherever_poses_are_refined(
 ) -> None:
     asked: list[bool] = []
 
-    def score(_field: object, _photo: object, poses: bool, _seed: int) -> float:
+    def score(_trained: object, _scene: object, _photo: object, poses: bool, _seed: int) -> float:
         asked.append(poses)
         return 20.0
 
@@ -81,10 +82,10 @@ def test_pilots_are_predicted_by_steps_and_fitted_poses(
     inputs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, device: str, fit: float
 ) -> None:
     on = {"cpu": fit, "cuda": 0.02}  # seconds of a step
-    monkeypatch.setattr("stages.hardware.device.compute_device", lambda: device)
-    monkeypatch.setattr("stages.hardware.device.cores", lambda: 16)
-    monkeypatch.setattr("stages.hardware.backend.chosen_backend", lambda _device: "torch")
-    monkeypatch.setattr("stages.train.planning.seconds_per_step", lambda *given: on[given[-1]])
+    monkeypatch.setattr(pilots, "compute_device", lambda: device)
+    monkeypatch.setattr(pilots, "cores", lambda: 16)
+    monkeypatch.setattr(pilots, "chosen_backend", lambda _device: "torch")
+    monkeypatch.setattr(pilots, "seconds_per_step", lambda *given: on[given[-1]])
     scene = read_scene(inputs["normalise"])
     without, fitting = pilots.expected_seconds(scene, 100)
     assert without == pytest.approx(1.3 * 6 * 100 * 0.02)
@@ -142,7 +143,7 @@ def test_an_effect_that_gains_nothing_rarely_pays() -> None:
 
 
 def test_a_photos_pose_is_found_against_a_finished_field(trial: PilotScene) -> None:
-    field, photo = pilots._trained(trial, PLAIN, 150, 0), trial.kept[0]
+    field, photo = pilots._trained(trial, PLAIN, 150, 0).field, trial.kept[0]
     rays = type(photo.rays)(*(part.flatten(0, 1) for part in photo.rays))
     black, view = torch.zeros(3), torch.zeros(len(rays.near), dtype=torch.int64)
     target = render_image(field, photo.rays, black).colour.flatten(0, 1)
@@ -158,13 +159,15 @@ def test_the_exposure_expected_of_an_unseen_photo_is_its_neighbours(inputs: dict
     scene = read_scene(inputs["normalise"])
     train, test = scene.of_split("train"), scene.of_split("test")
     photos = {view.name: [0.1 * i, 0.0, -0.1] for i, view in enumerate(train)}
-    gains = expected_gains({"exposure": {"neutral": [0.0] * 3, "photos": photos}}, scene, test)
-    weights = told_by_neighbours(scene, test)
-    assert weights.shape == (len(test), len(train)) and set(gains) == {view.name for view in test}
+    weights = held_out_images(train, test).weights
+    assert weights.shape == (len(test), len(train))
     for row, view in zip(weights, test, strict=True):
-        assert float(gains[view.name][0]) == pytest.approx(float(row @ (0.1 * torch.arange(len(train)))), abs=1e-6)
-        assert gains[view.name][1:].tolist() == pytest.approx([0.0, -0.1], abs=1e-6)
-    assert expected_gains({}, scene, test) == {}
+        (exposure,) = photo_effects({"effects": {"exposure": photos}}, scene, view)
+        expected = [float(row @ (0.1 * torch.arange(len(train)))), 0.0, -0.1]
+        assert exposure.rows.tolist() == [pytest.approx(expected, abs=1e-6)]
+    (exposure,) = photo_effects({"effects": {"exposure": photos}}, scene, train[2])
+    assert exposure.rows.tolist() == [pytest.approx([0.2, 0.0, -0.1])], "of a photo that was trained on: its own"
+    assert photo_effects({"effects": {}}, scene, test[0]) == ()
 
 
 def test_the_scenes_photos_are_as_bright_as_they_say(tmp_path: Path) -> None:

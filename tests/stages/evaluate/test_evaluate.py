@@ -97,7 +97,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
         identity = Similarity(1.0, np.eye(3), np.zeros(3))
         scene = Scene((camera,), tuple(views), identity, False, alpha, "inside", True)
         write_json(inputs["normalise"] / "scene.json", scene.to_json())
-        info = {"kind": "sky", "downscale": downscale, "background": [0.0, 0.0, 0.0]}
+        info = {"kind": "sky", "downscale": downscale, "background": [0.0, 0.0, 0.0], "effects": {}}
         write_json(inputs["train"] / "field.json", info)
         write_json(inputs["train"] / "curve.json", {"points": [{"seconds": 2.0}]})
         monkeypatch.setattr("stages.render.renderer.Renderer.rays_per_second", lambda *_: speed)

@@ -1,7 +1,6 @@
 """When test photos are scored at fitted poses, what is scored there, and that it is said."""
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,7 +13,8 @@ from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from stages import evaluate
-from stages.effects.decisions import Decisions, image_effects, learnt_of_photos
+from stages.effects.decisions import Decisions
+from stages.effects.image_effects import image_effects, learnt_effects, photo_effects
 from stages.evaluate import Examiner
 from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
 from stages.hardware.backend import chosen_backend, load_backend
@@ -30,21 +30,23 @@ def test_fitted_poses_are_scored_at_the_photos_exposure(tmp_path: Path, monkeypa
     field = HashGridField(
         HashGridSettings(num_levels=2, log2_hashmap_size=8, base_res=4, max_res=16, occupancy_resolution=8), 5, kernels
     )
-    plain, gain = Renderer(field, torch.zeros(3)), torch.full((3,), 0.7)
+    photos = {view.name: [0.7] * 3 for view in scene.of_split("train")}
+    info = {"effects": {"exposure": photos}}
     view, given = scene.of_split("test")[0], []
 
-    def fit(model: HashGridField, rays: Rays, rendering: Rendering, *_: object) -> Rays:
-        given.append((model, rendering.colour))
+    def fit(model: HashGridField, rays: Rays, rendering: Rendering, *others: Any) -> Rays:
+        given.append((model, rendering.colour, others[-1]))
         return rays._replace(near=rays.near + 0.5)  # seen from elsewhere
 
     monkeypatch.setattr("stages.evaluate.half_images.from_fitted_pose", fit)
     neutral = Renderer(AppearanceModel(field, (ExposureModel(torch.full((1, 3), 0.3)),)), torch.zeros(3))
-    examiner = Examiner(scene, inputs["ingest"], tmp_path, neutral, {view.name: gain}, True, 1.0)
+    examiner = Examiner(scene, inputs["ingest"], tmp_path, neutral, info, True, 1.0)
     (scored,) = examiner.score([view], Quiet())
     rays = view_rays(scene, view, 1.0)
-    assert given[0][0] is field and torch.equal(given[0][1], plain.draw(rays).colour)
+    exposed = neutral.through(photo_effects(info, scene, view))
+    assert given[0][0] is field and torch.equal(given[0][1], exposed.draw(rays).colour)
+    assert [effect.rows.tolist() for effect in given[0][2]] == [[pytest.approx([0.7] * 3)]]
     truth = PhotoReader(inputs["ingest"], scene, 1.0).pixels(view, (0.0,) * 3)
-    exposed = neutral.at_gain(gain)
     right, fitted = right_half_psnr(exposed.draw(rays), torch.zeros(3), truth)
     _, posed = right_half_psnr(exposed.draw(rays._replace(near=rays.near + 0.5)), torch.zeros(3), truth)
     assert scored["psnr_right_half"] == pytest.approx(right) and scored["psnr_exposure_fitted"] == pytest.approx(fitted)
@@ -58,8 +60,7 @@ def test_refined_poses_are_written_in_scene_units(tmp_path: Path) -> None:
     near = dataset._replace(known=dataset.first_pixel[:-1] + 5, distance=torch.full((len(views),), 0.25))
     effects = image_effects(Decisions({"pose_refinement": {}}), views, near)
     effects.rays[0].parameters["offset"][1] = torch.tensor([1.0, 0.0, -2.0])
-    trainer: Any = SimpleNamespace(effects=effects)
-    learnt = learnt_of_photos(trainer, views)["poses"]
+    learnt = learnt_effects(effects, views)["pose_refinement"]
     assert learnt[views[1].name] == [0.0, 0.0, 0.0, 0.25, 0.0, -0.5] and learnt[views[0].name] == [0.0] * 6
 
 
@@ -83,7 +84,7 @@ def test_a_test_pose_is_fitted_in_viewing_distances(monkeypatch: pytest.MonkeyPa
     [("auto", True, True), ("auto", False, False), ("on", False, True), ("off", True, False)],
 )
 def test_poses_are_fitted_where_training_refined_them_or_as_asked(asked: Any, refined: bool, fitted: bool) -> None:
-    field = {"kind": "grid"} | ({"poses": {"a.jpg": [0.0] * 6}} if refined else {})
+    field = {"kind": "grid", "effects": {"pose_refinement": {"a.jpg": [0.0] * 6}} if refined else {}}
     assert evaluate.fits_poses(evaluate.Config(fit_poses=asked), field) is fitted
 
 

@@ -10,7 +10,7 @@ from stages.contract import StageError
 from stages.hardware import memory
 from stages.hardware.memory import at_once, available_bytes, available_on, check_memory, rooms_in_groups
 from stages.io.photos import Photo
-from stages.sfm.colmap.database import BYTES_PER_SEARCHED_PIXEL, ExtractionOptions, feature_bytes
+from stages.sfm.colmap.database import BYTES_PER_PIXEL, ExtractionOptions, feature_bytes
 
 
 @pytest.fixture
@@ -77,7 +77,7 @@ def test_pieces_at_once(free, there: int, pieces: int):
 def test_features_are_searched_on_reduced_or_doubled_photos(size: tuple[int, int], side: int, searched: int):
     assert (
         feature_bytes([Photo("a", "images/a.png", *size, 0, None, None, False, 1.0)], ExtractionOptions(side, 100))
-        == BYTES_PER_SEARCHED_PIXEL * searched
+        == BYTES_PER_PIXEL * searched
     )
 
 

@@ -10,22 +10,23 @@ from nerf.effects.exposure import ExposureModel
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
+from nerf.geometry.space_maps import Contraction
 from stages.contract import StageError
 from stages.hardware.backend import BackendName, backend_name, chosen_backend, load_backend
 from stages.io.field_files import load_field, save_field
 from stages.io.files import read_json, read_tensors, write_json, write_tensors
 from tests.refusals import refused
 
-SMALL = VanillaSettings(depth=2, width=8, samples_coarse=4, samples_fine=4, contracted=True, spacing="log")
+SMALL = VanillaSettings(depth=2, width=8, samples_coarse=4, samples_fine=4, space=Contraction(), spacing="log")
 GRID = HashGridSettings(
-    num_levels=2, log2_hashmap_size=8, base_res=4, max_res=16, contracted=True, occupancy_resolution=8
+    num_levels=2, log2_hashmap_size=8, base_res=4, max_res=16, space=Contraction(), occupancy_resolution=8
 )
 KERNELS = load_backend(chosen_backend("cpu"), "cpu")
 OUTDOORS = HashGridField(replace(GRID, background_model=True), 5, KERNELS)
 OUTDOORS.background_table.normal_(generator=torch.Generator().manual_seed(6))
 KINDS = {"paper": VanillaNerf(SMALL, seed=5), "grid": HashGridField(GRID, 5, KERNELS), "sky": OUTDOORS}
 BY_TORCH = "the hash-grid field is computed by torch alone, as it was trained"
-INFO = {"background": [1.0, 1.0, 1.0], "downscale": 2.5, "steps": 7, "rays": 700}
+INFO = {"background": [1.0, 1.0, 1.0], "downscale": 2.5, "steps": 7, "rays": 700, "effects": {}}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -40,7 +41,7 @@ def test_a_field_comes_back_the_same(kind: str, tmp_path: Path) -> None:
     assert seen.opacity.min() > 0 and seen.colour.std() > 0
     assert {key: info[key] for key in INFO} == INFO
     assert info["kind"] == ("paper" if kind == "paper" else "grid")
-    assert info["settings"]["contracted"] is True
+    assert info["settings"]["space"] == {"kind": "contraction"}
 
 
 def test_files_are_read_from_folders_whose_names_are_not_unicode(tmp_path: Path) -> None:
@@ -94,16 +95,16 @@ def test_a_model_without_a_format_is_refused(tmp_path: Path) -> None:
 
 
 RAYS = Rays(torch.zeros(3, 3), torch.eye(3), torch.full((3,), 0.5), torch.full((3,), 4.0))
-EXPOSURE = {"neutral": [0.1, 0.0, -0.1], "photos": {"a.jpg": [0.5, 0.4, 0.3], "b 2.jpg": [-0.5, -0.4, -0.3]}}
+EXPOSURE = {"a.jpg": [0.5, 0.0, 0.3], "b 2.jpg": [0.1, 0.0, -0.1], "c.jpg": [-0.5, 0.0, -0.3]}
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_field_with_exposure_is_shown_at_the_neutral_one(kind: str, tmp_path: Path) -> None:
+def test_a_field_with_exposure_is_shown_at_the_reference(kind: str, tmp_path: Path) -> None:
     plain = KINDS[kind]
-    save_field(tmp_path, plain, INFO | {"exposure": EXPOSURE})
+    save_field(tmp_path, plain, INFO | {"effects": {"exposure": EXPOSURE}})
     loaded, info = load_field(tmp_path)
-    assert info["exposure"] == EXPOSURE and isinstance(loaded, AppearanceModel)
-    exposure = ExposureModel(torch.tensor([EXPOSURE["neutral"]]))
+    assert info["effects"] == {"exposure": EXPOSURE} and isinstance(loaded, AppearanceModel)
+    exposure = ExposureModel(torch.tensor([EXPOSURE["b 2.jpg"]]))
     wanted = AppearanceModel(plain, (exposure,)).render(RAYS, torch.ones(3)).colour
     assert torch.equal(loaded.render(RAYS, torch.ones(3)).colour, wanted)
     assert (wanted[:, 1] == plain.render(RAYS, torch.ones(3)).colour[:, 1]).all()
@@ -119,15 +120,18 @@ def test_a_field_without_exposure_is_the_field_itself(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "harm",
     [
-        {"neutral": [0.0, 0.0]},
-        {"photos": {"a.jpg": [0.0, "bright", 0.0]}},
-        {"photos": None},
-        {"neutral": 1.0},
-        {"neutral": [10**400, 0, 0]},
+        {"exposure": {"a.jpg": [0.0, 0.0]}},
+        {"exposure": {"a.jpg": [0.0, "bright", 0.0]}},
+        {"exposure": None},
+        {"exposure": {"a.jpg": 1.0}},
+        {"exposure": {"a.jpg": [10**400, 0, 0]}},
+        {"exposure": {"a.jpg": [1e39, 0, 0]}},
+        {"exposure": {}},
+        None,
     ],
 )
-def test_damaged_exposure_is_refused_in_words(harm: dict[str, object], tmp_path: Path) -> None:
-    save_field(tmp_path, KINDS["paper"], INFO | {"exposure": EXPOSURE | harm})
+def test_damaged_effects_are_refused_in_words(harm: object, tmp_path: Path) -> None:
+    save_field(tmp_path, KINDS["paper"], INFO | {"effects": harm})
     with refused("io.field-weights"):
         load_field(tmp_path)
 

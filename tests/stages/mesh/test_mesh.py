@@ -100,7 +100,7 @@ def run_mesh(tmp_path, progress, monkeypatch):
             path.mkdir(exist_ok=True)
         write_json(inputs["normalise"] / "scene.json", (scene or scene_around()).to_json())
         write_tensors(inputs["normalise"] / "points.safetensors", {"xyz": points})
-        info = {"rays": 1000} | (learnt or {})
+        info = {"rays": 1000, "effects": learnt or {}}
         write_json(inputs["train"] / "field.json", info)
         monkeypatch.setattr(extraction, "load_field", lambda *_: (model, info))
         config = mesh.Config.model_validate({"resolution": 48} | settings)
@@ -176,13 +176,13 @@ def test_the_facts_are_those_of_the_files(run_mesh):
     assert 0 < facts["iso_level"] < 300 and 0 < facts["surface_error_voxels"] < 0.5
 
 
-def test_colours_at_a_neutral_exposure_say_at_which(run_mesh):
+def test_colours_at_a_reference_exposure_say_at_which(run_mesh):
     result, _ = run_mesh(Solid(ball))
-    assert "exposure" not in result.facts and "expos" not in result.line
+    assert "appearance" not in result.facts and "expos" not in result.line
     stop = math.log(2)
     photos = {"a.jpg": [0.0, 0.1 * stop, 0.2 * stop], "b.jpg": [stop] * 3, "c.jpg": [2 * stop] * 3}
-    result, _ = run_mesh(Solid(ball), "exposed", learnt={"exposure": {"neutral": [stop] * 3, "photos": photos}})
-    assert result.facts["exposure"] == "reference exposure, +0.90 EV over the least exposed photo"
+    result, _ = run_mesh(Solid(ball), "exposed", learnt={"exposure": photos})
+    assert result.facts["appearance"] == "reference exposure, +0.90 EV over the least exposed photo"
     assert result.line.endswith("watertight · reference exposure, +0.90 EV over the least exposed photo")
 
 

@@ -69,7 +69,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     for folder in folders.values():
         folder.mkdir()
     write_json(folders["normalise"] / "scene.json", scene_with(ring(12, radius=2.5, height=0.8)).to_json())
-    info = {"background": [0.0, 0.0, 1.0], "downscale": 1.0, "rays": 100_000}
+    info = {"background": [0.0, 0.0, 1.0], "downscale": 1.0, "rays": 100_000, "effects": {}}
     write_json(folders["train"] / "field.json", info)
     write_json(folders["train"] / "curve.json", {"points": [{"step": 9, "seconds": 10.0}]})
     monkeypatch.setattr(
@@ -339,10 +339,10 @@ NEUTRAL = "reference exposure, +1.00 EV over the least exposed photo"
 
 
 def with_exposure(inputs, monkeypatch) -> None:
-    """The ball as a field with an exposure of its own and one photo a stop brighter."""
-    photos = {"bright.jpg": [np.log(2)] * 3, "dark.jpg": [-np.log(2)] * 3}
-    photos |= {f"{number}.jpg": [np.log(2)] * 3 for number in range(1, 12)}
-    info = read_json(inputs["train"] / "field.json") | {"exposure": {"neutral": [0.0] * 3, "photos": photos}}
+    """The ball as a field with an exposure of its own, half of the photos a stop brighter and half a stop darker."""
+    ev = [1, 1, 0, 0, 0, 0, 0, -1, 0, 1, 1]  # 0.jpg, the test photo, stands between the ends of the ring
+    photos = {f"{number}.jpg": [np.log(2) * gain] * 3 for number, gain in enumerate(ev, 1)}
+    info = read_json(inputs["train"] / "field.json") | {"effects": {"exposure": photos}}
     write_json(inputs["train"] / "field.json", info)
     shown = AppearanceModel(GreyBall(), (ExposureModel(torch.zeros(1, 3)),))
     monkeypatch.setattr("stages.render.renderer.load_field", lambda *_: (shown, info))
@@ -355,15 +355,15 @@ class GreyBall(Ball):
 
 @pytest.mark.parametrize(
     ("like", "level", "words"),
-    [(None, 0.5, NEUTRAL), ("bright.jpg", 0.6858, "exposed like bright.jpg"),
-     ("dark.jpg", 0.3608, "exposed like dark.jpg")],
+    [(None, 0.5, NEUTRAL), ("1.jpg", 0.6858, "exposed like 1.jpg"),
+     ("8.jpg", 0.3608, "exposed like 8.jpg")],
 )  # fmt: skip
 def test_a_field_with_exposure_is_rendered_at_a_stated_one(
     inputs, progress, monkeypatch, like: str | None, level: float, words: str
 ) -> None:
     with_exposure(inputs, monkeypatch)
     result = run(inputs, progress, frames=2, width=40, match_exposure=like, save_frames=True)
-    assert result.facts["exposure"] == words and f" · {words} · " in result.line
+    assert result.facts["appearance"] == words and f" · {words} · " in result.line
     frame = np.asarray(Image.open(inputs["render"] / "frames/00000.png"))
     assert np.abs(frame[15, 20] / 255 - level).max() < 0.004
     assert frame[1, 1].tolist() == [0, 0, 255]  # the background has no exposure
@@ -371,25 +371,25 @@ def test_a_field_with_exposure_is_rendered_at_a_stated_one(
 
 def test_a_field_without_exposure_says_nothing_of_it(inputs, progress) -> None:
     result = run(inputs, progress, frames=2, width=40)
-    assert "exposure" not in result.facts and "expos" not in result.line
+    assert "appearance" not in result.facts and "expos" not in result.line
     progress.notes.clear()
-    assert "exposure" not in run(inputs, progress, frames=2, width=40, match_exposure="3.jpg").facts
+    assert "appearance" not in run(inputs, progress, frames=2, width=40, match_exposure="3.jpg").facts
     assert progress.notes == ["exposure is not modelled: all photos count as exposed alike, and the video like 3.jpg"]
 
 
 @pytest.mark.parametrize(
-    ("like", "level", "exposure", "note"),
+    ("like", "level", "words", "note"),
     [
         ("0.jpg", 0.6858, "exposed as expected of 0.jpg", "0.jpg was not trained on: its exposure is what the photos"),
-        ("lark.jpg", 0.5, NEUTRAL, f"no photo lark.jpg has a camera: {NEUTRAL}; perhaps dark.jpg"),
+        ("81.jpg", 0.5, NEUTRAL, f"no photo 81.jpg has a camera: {NEUTRAL}; perhaps 8.jpg"),
     ],
 )
 def test_missing_exposure_is_no_error_after_training(
-    inputs, progress, monkeypatch, like: str, level: float, exposure: str, note: str
+    inputs, progress, monkeypatch, like: str, level: float, words: str, note: str
 ) -> None:
     with_exposure(inputs, monkeypatch)
     result = run(inputs, progress, frames=2, width=40, match_exposure=like, save_frames=True)
-    assert result.facts["exposure"] == exposure and progress.notes[-1].startswith(note)
+    assert result.facts["appearance"] == words and progress.notes[-1].startswith(note)
     frame = np.asarray(Image.open(inputs["render"] / "frames/00000.png"))
     assert np.abs(frame[15, 20] / 255 - level).max() < 0.004
 

@@ -144,7 +144,7 @@ def _write_metrics(folder: Path, scene: Scene, size: tuple[int, int]) -> None:
         images.append({"name": view.name, "render": f"renders/{file}", "error": f"errors/{file}"} | figures)
     overall = {"psnr": 21.5, "ssim": 0.62, "psnr_mean_image": 12.9, "psnr_nearest_view": 14.2}
     overall |= {"psnr_right_half": 21.0, "psnr_exposure_fitted": 25.8, "psnr_pose_fitted": None}
-    overall |= {"poses_fitted": False, "exposure": None}
+    overall |= {"poses_fitted": False, "appearance": []}
     counts = {
         "background": [1.0, 1.0, 1.0],
         "photos_scored": len(images),

@@ -35,7 +35,7 @@ def check(**changed: Any) -> dict[str, Any]:
 
 def opinion(**changed: Any) -> dict[str, Any]:
     agree = {"photos": PHOTOS, "agree": PHOTOS, "different": [], "centre": 0.0006, "degrees": 0.02, "failed": None}
-    return agree | changed
+    return agree | {"agreeing": 100, "agreeing_global": 100} | changed
 
 
 def weak(*counts: int) -> list[dict[str, Any]]:
@@ -82,6 +82,7 @@ def test_each_kind_of_doubt_makes_the_cameras_doubtful(changed: dict[str, Any], 
         ({"check": check(weak_links=weak(1))}, 1),
         ({"check": check(sequence_breaks=[[file, file] for file in files(3)])}, 1),
         ({"global_mapping": opinion(different=files(3))}, 0),
+        ({"global_mapping": opinion(different=files(40), agreeing_global=89)}, 0),
         ({"global_mapping": {"failed": "global mapping found no model"}}, 0),
     ],
 )
@@ -98,6 +99,11 @@ def test_of_a_large_group_the_first_photos_are_shown() -> None:
 def test_weak_links_are_shown_largest_first() -> None:
     groups = camera_report(registration(check=check(weak_links=weak(1, 2, 3, 4, 5, 6, 1))), {}).groups
     assert [len(group.files) + group.more for group in groups] == [6, 5, 4, 3, 1 + 2 + 1]
+
+
+def test_a_contradicted_global_mapping_casts_no_doubt() -> None:
+    said = camera_report(registration(global_mapping=opinion(different=files(40), agreeing_global=89)), {})
+    assert said.figures and re.findall(r"[\d.]*\d", said.figures)[3:] == ["40", "89", "100"]
 
 
 @pytest.mark.parametrize("second", [None, {"failed": "global mapping found no model"}, opinion(centre=None)])

@@ -25,12 +25,15 @@ def test_page_shows_both_scores_of_right_halves(tmp_path: Path, progress: Any):
 
 def test_page_says_how_unseen_photos_were_exposed(tmp_path: Path, progress: Any):
     inputs = make_workspace(tmp_path)
-    assert "was rendered exposed" not in written(inputs, tmp_path / "out", progress)[0]
+    assert "Each test photo was rendered" not in written(inputs, tmp_path / "out", progress)[0]
     path = inputs["evaluate"] / "metrics.json"
     metrics = json.loads(path.read_text("utf-8"))
-    write_json(path, metrics | {"exposure": "as the photos taken nearest by"})
+    write_json(path, metrics | {"appearance": ["exposed as the photos taken nearest by", "darkened"]})
     html, _ = written(inputs, tmp_path / "exposed", progress)
-    assert "Each test photo was rendered exposed as the photos taken nearest by, four training photos;" in html
+    assert (
+        "Each test photo was rendered exposed as the photos taken nearest by and darkened; nothing was fitted to it"
+        in html
+    )
 
 
 def test_page_shows_what_fitted_poses_add_apart_from_fitted_exposures(tmp_path: Path, progress: Any):

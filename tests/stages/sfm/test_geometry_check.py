@@ -139,6 +139,35 @@ def test_a_single_pair_across_is_a_weak_link() -> None:
     assert check.passed.all() and link.photos == list(range(7)) and link.pairs == 1
 
 
+def test_chance_matches_cut_off_no_photo() -> None:
+    """They have no more than verification lets pass, and would tell wrong depths of what the right pair sees."""
+    matches, poses = walk()
+    random, last = np.random.default_rng(3), 29
+    matches = restricted(matches, (matches.pairs[:, 1] != last) | (matches.pairs[:, 0] == last - 1))
+    held = int(np.flatnonzero(matches.pairs[:, 1] == last)[0])
+    mine = matches.pair == held  # and no other photo sees what these two do
+    lone = ~np.isin(matches.keypoint, matches.keypoint[mine]).any(axis=1)
+    matches = matches._replace(pair=matches.pair[lone | mine], keypoint=matches.keypoint[lone | mine])
+    seen = matches.keypoint[matches.pair == held, 1]
+    partners = np.arange(24, 28)
+    chance = [
+        np.stack([random.choice(np.flatnonzero(matches.photo == photo), 20), random.choice(seen, 20)], axis=1)
+        for photo in partners
+    ]
+    matches = matches._replace(
+        pairs=np.concatenate([matches.pairs, np.stack([partners, np.full(4, last)], axis=1)]),
+        weight=np.concatenate([matches.weight, np.full(4, 20.0)]),
+        pair=np.concatenate([matches.pair, np.repeat(len(matches.pairs) + np.arange(4), 20)]),
+        keypoint=np.concatenate([matches.keypoint, *chance]),
+    )
+    check = check_poses(matches, poses)
+    assert check.passed.all() and not check.contradicts.any() and check.agrees[held]
+    assert check.photo_error_px[last] < 1.5
+    assert [link.photos for link in weak_links(matches, check)] == [[last]]
+    elsewhere = check_poses(matches, moved(poses, [last], 5.0))  # epipolar lines notice
+    assert np.flatnonzero(~elsewhere.passed).tolist() == [last]
+
+
 @pytest.mark.parametrize(
     ("middle", "led_through", "lost"),
     [

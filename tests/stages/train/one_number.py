@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nerf.effects import NO_EFFECTS
+from nerf.effects import NO_EFFECTS, HeldOutImages, Images
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from nerf.training.trainer import StepResult
@@ -77,7 +77,8 @@ def probe() -> Probe:
 
 def unseen() -> Unseen:
     """The same rays; their patches are too small for SSIM."""
-    return Unseen(probe(), Patches(probe(), torch.ones(2, 1, 1, dtype=torch.bool)), torch.eye(2))
+    photos = HeldOutImages(Images(torch.zeros(2, 3, 4)), torch.eye(2))
+    return Unseen(probe(), Patches(probe(), torch.ones(2, 1, 1, dtype=torch.bool)), photos)
 
 
 def run_in(

@@ -18,6 +18,7 @@ from torch import Tensor
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
+from nerf.geometry.space_maps import Contraction
 from nerf.kernels import RayStepping, grid_layout, warp
 from nerf.kernels.torch.occupancy import binary_occupancy
 from nerf.runtime.parallel import take_over_cores
@@ -71,7 +72,7 @@ def noise_dataset() -> RayDataset:
 BOUNDED = HashGridSettings(
     num_levels=3, log2_hashmap_size=8, base_res=4, max_res=16, diagonal_steps=32, occupancy_resolution=8
 )
-OUTDOORS = replace(BOUNDED, contracted=True, min_step_size=0.1, cone_angle=0.1, background_model=True)
+OUTDOORS = replace(BOUNDED, space=Contraction(), min_step_size=0.1, cone_angle=0.1, background_model=True)
 
 
 def small_trainer(field: HashGridSettings) -> HashGridTrainer:

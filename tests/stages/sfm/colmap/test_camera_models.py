@@ -35,7 +35,7 @@ BARREL = lens("SIMPLE_RADIAL", 800, *CENTRE, -0.2)
 def test_the_lens_is_the_simplest_that_describes_the_truth(camera: Camera, expected: CameraModelCandidate) -> None:
     model = mapped(photographed(camera))
     choice = choose(model, seed=0)
-    assert choice.lenses == {1: expected}
+    assert choice.chosen == {1: expected}
     assert [row["model"] for row in choice.table if row["chosen"]] == [expected.model]
     assert 0.4 < choice.noise_px < 0.6  # half a pixel
     set_camera_models(model, {1: expected.model})
@@ -46,7 +46,7 @@ def test_the_lens_is_the_simplest_that_describes_the_truth(camera: Camera, expec
 def test_a_150_degree_fisheye_is_told_by_mapping() -> None:
     camera = lens("OPENCV_FISHEYE", 344, 344, *CENTRE, 0.02, -0.01, 0, 0)
     choice = choose(mapped(photographed(camera, points=1200, room=True), widest=60), seed=0)
-    assert choice.lenses[1].model.endswith("FISHEYE")
+    assert choice.chosen[1].model.endswith("FISHEYE")
     assert "its distortion cannot be undone" in str([row["reason"] for row in choice.table])
 
 
@@ -67,13 +67,13 @@ def test_the_choice_repeats_and_says_why() -> None:
 def test_without_evidence_it_stays_simple() -> None:
     faint = lens("SIMPLE_RADIAL", 900, *CENTRE, -0.002)
     choice = choose(mapped(photographed(faint, points=80)), seed=0)
-    assert choice.lenses == {1: CameraModelCandidate("SIMPLE_PINHOLE", False)}
+    assert choice.chosen == {1: CameraModelCandidate("SIMPLE_PINHOLE", False)}
     assert choice.notes[0].endswith("and no richer one is better by more than the noise")
 
 
 def test_with_too_few_points_nothing_is_compared() -> None:
     choice = choose(mapped(photographed(PINHOLE, photos=4, points=40)), seed=0)
-    assert choice.lenses == {1: CameraModelCandidate("SIMPLE_RADIAL", False)}
+    assert choice.chosen == {1: CameraModelCandidate("SIMPLE_RADIAL", False)}
     assert choice.table == []
     assert choice.notes[0].endswith("points are seen in three photos, too few to compare camera models")
 
@@ -94,7 +94,7 @@ def test_of_a_given_model_only_the_principal_point_is_chosen() -> None:
 
 def test_every_camera_is_judged_by_its_own_photos() -> None:
     choice = choose(mapped(photographed(PINHOLE, BARREL, points=250)), 0)
-    assert choice.lenses == {
+    assert choice.chosen == {
         1: CameraModelCandidate("SIMPLE_PINHOLE", False),
         2: CameraModelCandidate("SIMPLE_RADIAL", False),
     }
@@ -104,14 +104,14 @@ def test_every_camera_is_judged_by_its_own_photos() -> None:
 
 def test_cameras_that_come_out_alike_are_judged_once_more_together() -> None:
     choice = choose(mapped(photographed(BARREL, BARREL, points=150)), 0)
-    assert choice.lenses == dict.fromkeys((1, 2), CameraModelCandidate("SIMPLE_RADIAL", False))
+    assert choice.chosen == dict.fromkeys((1, 2), CameraModelCandidate("SIMPLE_RADIAL", False))
     assert {(row["group"], row["photos"]) for row in choice.table} == {(0, 10)}
     assert len(choice.notes) == 1
 
 
 def test_cameras_with_few_photos_are_judged_together() -> None:
     choice = choose(mapped(photographed(*5 * [BARREL], points=100)), 0)  # two photos each
-    assert choice.lenses == dict.fromkeys(range(1, 6), CameraModelCandidate("SIMPLE_RADIAL", False))
+    assert choice.chosen == dict.fromkeys(range(1, 6), CameraModelCandidate("SIMPLE_RADIAL", False))
     assert {(row["group"], row["photos"]) for row in choice.table} == {(0, 10)}
     assert len(choice.notes) == 1
 
@@ -119,7 +119,7 @@ def test_cameras_with_few_photos_are_judged_together() -> None:
 def test_where_every_candidate_is_degenerate_the_camera_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera_models, "why_degenerate", lambda camera: "it is wrong")
     choice = choose(mapped(photographed(PINHOLE, photos=6, points=80)), 0)
-    assert choice.lenses == {1: CameraModelCandidate("SIMPLE_RADIAL", False)}
+    assert choice.chosen == {1: CameraModelCandidate("SIMPLE_RADIAL", False)}
     assert {row["reason"] for row in choice.table} == {"it is wrong"}
     assert choice.notes[0].endswith("every candidate is degenerate, so it stays as mapping had it")
 
@@ -131,14 +131,14 @@ def test_few_degenerate_cameras_do_not_decide_for_others(monkeypatch: pytest.Mon
         lambda camera: "it is wrong" if camera.camera_id == 5 else why_degenerate(camera),
     )
     choice = choose(mapped(photographed(*5 * [PINHOLE], points=100)), 0)  # two photos each
-    assert choice.lenses == dict.fromkeys(range(1, 6), CameraModelCandidate("SIMPLE_PINHOLE", False))
+    assert choice.chosen == dict.fromkeys(range(1, 6), CameraModelCandidate("SIMPLE_PINHOLE", False))
     monkeypatch.setattr(
         camera_models,
         "why_degenerate",
         lambda camera: "it is wrong" if camera.camera_id > 3 else why_degenerate(camera),
     )
     choice = choose(mapped(photographed(*5 * [PINHOLE], points=100)), 0)
-    assert choice.lenses == dict.fromkeys(range(1, 6), CameraModelCandidate("SIMPLE_RADIAL", False)), (
+    assert choice.chosen == dict.fromkeys(range(1, 6), CameraModelCandidate("SIMPLE_RADIAL", False)), (
         "as mapping had them"
     )
 

@@ -204,7 +204,7 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"fl_x": 10**400}, r"camera of frame './1': its fl_x is 10{39}, not a finite number"),
         ({"cx": -1e300}, r"camera of frame './1': its principal point \(-1e\+300, 20\) is far outside of its 60×40"),
         ({"w": 10**30, "h": 10**30}, r"camera of frame './1': its w and h are 1e\+30 and 1e\+30"),
-        ({"transform_matrix": _with(0, 3, 1e300)}, r"frame './1': its place is 1e\+300 units from the origin"),
+        ({"transform_matrix": _with(0, 3, 1e300)}, r"frame './1': its position is 1e\+300 units from the origin"),
         ({"transform_matrix": _with(0, 0, 1e308)}, r"frame './1': it is no rotation: 1e\+308 is in it"),
         ({"transform_matrix": _with(0, 0, 10**400)}, r"frame './1': its transform_matrix is not a matrix of numbers"),
         ({"fl_x": math.nan}, r"camera of frame './1': its fl_x is nan, not a finite number"),
@@ -221,9 +221,12 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"camera_model": "VR180_L"}, r"frame './1': its camera_model is 'VR180_L', which is none of"),
         ({"camera_model": "RAD_TAN_THIN_PRISM_FISHEYE"}, r"its camera_model is 'RAD_TAN_THIN_PRISM_FISHEYE', which is"),
         ({"camera_model": ["OPENCV"]}, r"frame './1': its camera_model is \['OPENCV'\], which is none of"),
-        ({"ftheta_p0": 0.0}, r"frame './1': it has ftheta_p0: lenses of that kind are not supported"),
-        ({"latlong": True}, r"frame './1': it has latlong: lenses of that kind are not supported"),
-        ({"equirectangular": True}, r"frame './1': it has equirectangular: lenses of that kind are not supported"),
+        ({"ftheta_p0": 0.0}, r"frame './1': it has ftheta_p0: camera models of that kind are not supported"),
+        ({"latlong": True}, r"frame './1': it has latlong: camera models of that kind are not supported"),
+        (
+            {"equirectangular": True},
+            r"frame './1': it has equirectangular: camera models of that kind are not supported",
+        ),
         ({"distortion_params": [0.1, 0.2]}, r"frame './1': its distortion_params are not six numbers, k1, k2, k3, k4"),
         ({"distortion_params": [0.1, 0, 0, 0, 0, None]}, r"frame './1': its p2 is None, not a finite number"),
         ({"distortion_params": [0, 0, 0, 0.1, 0, 0]}, r"frame './1': it has a k4, and its camera_model is not FULL_"),
@@ -329,7 +332,7 @@ def test_frames_without_photo_and_photos_without_frame_are_named(read) -> None:
     known = read([frame(0), frame(1), frame(7)], **LENS)
     assert known.notes == ["1 cameras have no photo: ./7", "1 photos have no camera and are left out: ä2.png"]
     assert [entry["registered"] for entry in known.account(PHOTOS)] == [True, True, False]
-    assert known.account(PHOTOS)[2]["reason"] == "the given cameras have none for it"
+    assert known.account(PHOTOS)[2]["reason"] == "it has no imported pose"
 
 
 def test_no_frame_with_a_photo_is_an_error(read) -> None:
@@ -380,7 +383,7 @@ def test_blender_folders_keep_their_split(tmp_path: Path, with_test: bool) -> No
 def test_lenses_that_are_said_to_be_approximations_are_noted(read) -> None:
     note = intrinsics(Camera("FOV", W, H, (50.0, 52.0, 31.0, 19.0, 0.9)))["note"]
     known = read([frame(0, note=note), frame(1, note="by hand"), frame(2, note=note)], **LENS)
-    assert known.notes == ["the lenses of 2 frames are approximations, as their notes in the file say"]
+    assert known.notes == ["the camera models of 2 frames are approximations, as their notes in the file say"]
 
 
 def colmap_model(folder: Path, names: list[str]) -> SparseModel:

@@ -1,7 +1,14 @@
 import numpy as np
 import pytest
 
-from stages.sfm.pairs.feature_matching import BLOCK, FARTHEST, PROBES, index_features, match_descriptors, match_indexed
+from stages.sfm.pairs.feature_matching import (
+    BLOCK,
+    MAX_DISTANCE,
+    PROBES,
+    index_features,
+    match_descriptors,
+    match_indexed,
+)
 from stages.sfm.pairs.image_retrieval import CELLS, visual_words
 
 
@@ -17,7 +24,7 @@ def one_by_one(first: np.ndarray, second: np.ndarray, max_ratio: float) -> list[
 
     def keeps(distances: np.ndarray, chosen: int) -> bool:
         others = np.delete(distances, chosen)
-        near = distances[chosen] < FARTHEST**2
+        near = distances[chosen] < MAX_DISTANCE**2
         return near and (not len(others) or distances[chosen] < max_ratio**2 * others.min())
 
     best = squared.argmin(axis=1)
@@ -69,7 +76,7 @@ def test_what_repeats_is_not_matched() -> None:
 
 def test_far_descriptors_are_not_matched() -> None:
     here, far = np.zeros((1, 128), np.uint8), np.zeros((1, 128), np.uint8)
-    for square, expected in ((358, 1), (359, 0)):  # FARTHEST is 358.4
+    for square, expected in ((358, 1), (359, 0)):  # MAX_DISTANCE is 358.4
         far[0, :2] = 255, round((square**2 - 255**2) ** 0.5)
         assert len(match_descriptors(here, far, 0.8)) == expected
 

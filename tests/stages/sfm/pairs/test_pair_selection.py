@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerf.geometry.georeference import cartesian
+from stages.sfm.pairs import MAX_EXHAUSTIVE
 from stages.sfm.pairs.pair_selection import (
-    MAX_EXHAUSTIVE,
     CapturePriors,
     choose,
     closeness,

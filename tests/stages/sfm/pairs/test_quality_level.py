@@ -10,9 +10,9 @@ from stages.sfm.pairs import quality_level
 from stages.sfm.pairs.pair_selection import CapturePriors
 from stages.sfm.pairs.quality_level import (
     QUALITY_LEVELS,
-    Chosen,
+    ChosenOptions,
     Cost,
-    Open,
+    GivenOptions,
     QualityLevel,
     _sample,
     check_matcher,
@@ -22,7 +22,7 @@ from stages.sfm.pairs.quality_level import (
 )
 from tests.synthetic_photos import SyntheticPhotos
 
-ALL_OPEN = Open(None, None, None)
+ALL_OPEN = GivenOptions(None, None, None)
 
 
 def photos(count: int) -> list[Photo]:
@@ -42,7 +42,7 @@ def costing(monkeypatch: pytest.MonkeyPatch, *seconds: tuple[float, float]) -> l
 
 
 @pytest.mark.parametrize(
-    ("places", "matcher"),
+    ("priors", "matcher"),
     [
         (CapturePriors(), "retrieval"),
         (CapturePriors(time_s=np.arange(400.0)), "sequential"),
@@ -50,10 +50,10 @@ def costing(monkeypatch: pytest.MonkeyPatch, *seconds: tuple[float, float]) -> l
     ],
 )
 def test_pairs_of_many_photos_are_chosen_by_what_is_known(
-    places: CapturePriors, matcher: str, progress, monkeypatch: pytest.MonkeyPatch
+    priors: CapturePriors, matcher: str, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = costing(monkeypatch)
-    monkeypatch.setattr(quality_level, "capture_priors", lambda _: places)
+    monkeypatch.setattr(quality_level, "capture_priors", lambda _: priors)
     assert chosen(ALL_OPEN, photos(400), Path(), 30, progress, None) == (1600, 4096, matcher)
     assert not asked and len(progress.notes) == 1
 
@@ -71,27 +71,27 @@ def test_features_give_way_only_to_a_time_that_is_given(
     costs: list[tuple[float, float]], tier: QualityLevel, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = costing(monkeypatch, *costs)
-    assert chosen(ALL_OPEN, photos(400), Path(), 30, progress, 900.0) == Chosen(*tier, "retrieval")
+    assert chosen(ALL_OPEN, photos(400), Path(), 30, progress, 900.0) == ChosenOptions(*tier, "retrieval")
     assert asked == list(QUALITY_LEVELS[: len(costs)])
-    assert chosen(ALL_OPEN, photos(400), Path(), 30, progress, None) == Chosen(1600, 4096, "retrieval")
+    assert chosen(ALL_OPEN, photos(400), Path(), 30, progress, None) == ChosenOptions(1600, 4096, "retrieval")
 
 
 def test_what_is_given_stays_in_every_tier(progress, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert quality_levels(Open(None, 8192, None)) == [QualityLevel(1600, 8192), QualityLevel(1131, 8192)]
-    assert quality_levels(Open(2400, None, None)) == [
+    assert quality_levels(GivenOptions(None, 8192, None)) == [QualityLevel(1600, 8192), QualityLevel(1131, 8192)]
+    assert quality_levels(GivenOptions(2400, None, None)) == [
         QualityLevel(2400, 4096),
         QualityLevel(2400, 2048),
         QualityLevel(2400, 1024),
     ]
     asked = costing(monkeypatch, (0.36, 0.034), (0.18, 0.009))
-    every_pair = chosen(Open(None, None, "exhaustive"), photos(200), Path(), 30, progress, 900.0)
-    assert every_pair == Chosen(1131, 2048, "exhaustive") and len(asked) == 2
+    every_pair = chosen(GivenOptions(None, None, "exhaustive"), photos(200), Path(), 30, progress, 900.0)
+    assert every_pair == ChosenOptions(1131, 2048, "exhaustive") and len(asked) == 2
     assert len(progress.notes) == 1
 
 
 def test_nothing_is_measured_without_a_time(progress, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quality_level, "COMMAND", ["-c", "raise SystemExit('measured')"])
-    assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, None) == Chosen(1600, 4096, "exhaustive")
+    assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, None) == ChosenOptions(1600, 4096, "exhaustive")
     with pytest.raises(StageError) as caught:
         chosen(ALL_OPEN, photos(400), Path(), 30, progress, 60.0)
     assert (caught.value.what, caught.value.why) == ("could not measure what features and matches take", "measured")
@@ -123,25 +123,25 @@ def test_features_and_pairs_take_time(synthetic_photos: SyntheticPhotos, indexed
     assert cost.of(10, 45) == 10 * cost.per_photo + 45 * cost.per_pair
 
 
-def test_places_are_needed_to_go_by_places() -> None:
+def test_spatial_matching_needs_gps_positions() -> None:
     check_matcher("spatial", CapturePriors(position_m=np.zeros((3, 3))))
     check_matcher("retrieval", CapturePriors())
     with pytest.raises(StageError) as caught:
         check_matcher("spatial", CapturePriors())
-    assert caught.value.what == "cannot choose pairs of photos by place"
+    assert caught.value.what == "cannot select pairs of photos by GPS position"
     assert caught.value.why == "not all photos tell by EXIF where they were taken"
     assert "--sfm.matcher retrieval" in caught.value.hint
 
 
 def test_with_time_given_ordinary_sets_reduce_too(progress, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = costing(monkeypatch, (0.5, 0.05), (0.2, 0.01))
-    assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, 60.0) == Chosen(1131, 2048, "exhaustive")
-    assert asked == list(QUALITY_LEVELS[:2]) and "50 photos searched at 1600 pixels" in progress.notes[0]
+    assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, 60.0) == ChosenOptions(1131, 2048, "exhaustive")
+    assert asked == list(QUALITY_LEVELS[:2]) and "with 4096 features a photo at 1600 pixels, about" in progress.notes[0]
 
 
 def test_time_enough_is_found_by_measuring_or_beyond_doubt_without(progress, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = costing(monkeypatch, (0.13, 0.012))
-    assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, 60.0) == Chosen(1600, 4096, "exhaustive")
+    assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, 60.0) == ChosenOptions(1600, 4096, "exhaustive")
     assert len(asked) == 1
-    assert chosen(ALL_OPEN, photos(11), Path(), 30, progress, 90.0) == Chosen(1600, 4096, "exhaustive")
+    assert chosen(ALL_OPEN, photos(11), Path(), 30, progress, 90.0) == ChosenOptions(1600, 4096, "exhaustive")
     assert len(asked) == 1

@@ -61,7 +61,13 @@ def test_photos_whose_lens_folds_in_the_corners_are_left_out(read: Any, tmp_path
     ]
     account = known.account(photos(5))
     assert [entry["registered"] for entry in account] == [True, False, True, True, True]
-    assert [entry["reason"] for entry in account] == [None, f"its given camera cannot be used: {WHY}", None, None, None]
+    assert [entry["reason"] for entry in account] == [
+        None,
+        f"its imported camera cannot be used: {WHY}",
+        None,
+        None,
+        None,
+    ]
     if read is from_transforms:
         assert known.test_files == ["0.jpg"]
     else:
@@ -80,4 +86,4 @@ def test_where_half_of_the_lenses_fold_the_first_is_named(read: Any, tmp_path: P
     words = r"the OPENCV camera of '2\.jpg' has no ray for 0\.485% of its pixels"
     with pytest.raises(StageError, match=words) as raised:
         read(tmp_path, [2, 3], 4)
-    assert raised.value.hint == "Check the distortion of the given cameras, or give the photos without cameras."
+    assert raised.value.hint == "Check the distortion of the imported cameras, or give the photos without cameras."

@@ -1,0 +1,281 @@
+"""Space maps: how a scene is laid out in the cube of half side ``half``, about the origin, that a field fills.
+
+* :class:`Box`: the region of interest as it is. Nothing beyond it is seen.
+* :class:`Contraction`: all of space (nerf/geometry/contraction.py), for cameras that look anywhere.
+* :class:`Ndc`: all that cameras which face one way can see, to infinity: normalised device coordinates (Mildenhall et
+  al. 2020, appendix C).
+
+Box and Ndc take straight lines to straight lines. So rays are mapped once (:class:`MappedRays`), and what marches them
+by equal steps through a cube needs to know no map. The contraction ``bends_rays``: it is applied to every sample, and
+steps grow with the distance. Densities are per scene unit in all of them, other than in the paper: they do not depend
+on the direction, and a young field is thin before the cameras, where the cube is large and little is known.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerf import REGION_HALF
+from nerf.geometry.contraction import contract, uncontract
+from nerf.geometry.rays import Rays
+
+SpaceName = Literal["box", "contraction", "ndc"]
+
+# Of the near plane's depth: points nearer to the apex's plane than this, or behind it, are mapped as if they were here,
+# far outside of the cube.
+MIN_DEPTH = 1e-3
+MAX_ANGLE_DEG = 75.0  # of a ray off the mean axis, for a pyramid to hold it; at 90 it would be as wide as space
+MIN_REST = 1e-6  # of a ray's depth at its start over that at a sample: no sample is mapped back to beyond 1e6 times it
+
+
+class Line(NamedTuple):
+    """A ray through :class:`Ndc`: at the distance ``start`` its ``depth`` begins to change by ``slope`` per distance,
+    and it moves at ``speed`` in d / (depth at d), d being the distance from there."""
+
+    start: Float[Tensor, "*rays"]
+    depth: Float[Tensor, "*rays"]
+    slope: Float[Tensor, "*rays"]
+    speed: Float[Tensor, "*rays"]
+
+
+class MappedRays(NamedTuple):
+    """``rays`` as straight lines in the space where they are marched, and the way back. ``line``: None where that is
+    the scene itself."""
+
+    rays: Rays
+    line: Line | None = None
+
+    def to_scene(self, t: Float[Tensor, "*samples"], ray: Int[Tensor, "samples"] | None = None) -> Tensor:
+        """Distances in the scene of those along ``rays``: (rays, n), or packed ones with the ``ray`` of each."""
+        if self.line is None:
+            return t
+        start, depth, slope, speed = (each[..., None] if ray is None else each[ray] for each in self.line)
+        share = t / speed
+        return start + share * depth / (1 - share * slope).clamp(min=MIN_REST)
+
+    def scene_length(
+        self, t: Float[Tensor, "samples"], ray: Int[Tensor, "samples"]
+    ) -> float | Float[Tensor, "samples"]:
+        """Length in the scene for a length along ``rays`` at packed samples: the derivative of :meth:`to_scene`."""
+        if self.line is None:
+            return 1.0
+        _, depth, slope, speed = (each[ray] for each in self.line)
+        return depth / (speed * (1 - t / speed * slope).clamp(min=MIN_REST).square())
+
+    def from_scene(self, distance: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
+        """Distances along ``rays`` of those in the scene, one for each; 0 for what is before where they start."""
+        if self.line is None:
+            return distance
+        start, depth, slope, speed = self.line
+        beyond = (distance - start).clamp(min=0)
+        return speed * beyond / (depth + slope * beyond).clamp(min=MIN_REST * depth)
+
+
+@dataclass(frozen=True)
+class Box:
+    """The cube [-0.9, 0.9]³ of the scene frame."""
+
+    kind: Literal["box"] = "box"
+    half: ClassVar[float] = REGION_HALF
+    bends_rays: ClassVar[bool] = False
+    unbounded: ClassVar[bool] = False
+
+    def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+        """Of scene points: themselves."""
+        return points
+
+    def inverse(self, mapped: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+        """The scene points again."""
+        return mapped
+
+    def map_rays(self, rays: Rays) -> MappedRays:
+        """Rays as they are marched."""
+        return MappedRays(rays)
+
+
+@dataclass(frozen=True)
+class Contraction:
+    """All of space in (-2, 2)³."""
+
+    kind: Literal["contraction"] = "contraction"
+    half: ClassVar[float] = 2.0
+    bends_rays: ClassVar[bool] = True
+    unbounded: ClassVar[bool] = True
+
+    def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+        """Contracted points."""
+        return contract(points)
+
+    def inverse(self, mapped: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+        """The scene points again."""
+        return uncontract(mapped)
+
+    def map_rays(self, rays: Rays) -> MappedRays:
+        """Rays as they are marched."""
+        return MappedRays(rays)
+
+
+@dataclass(frozen=True)
+class Ndc:
+    """The pyramid that a virtual camera at ``apex`` sees beyond the depth ``near``, in (-0.9, 0.9)³.
+
+    ``axes``: the camera's x (right), y (down) and z (forward) in the scene frame. ``slopes``: how far the pyramid
+    reaches to the side at depth 1, along x and y. A point at depth Z goes to half (X / (Z slope_x), Y / (Z slope_y),
+    1 - 2 near / Z): appendix C with the signs of our axes. The far plane is at infinity, where the cube ends.
+    """
+
+    apex: tuple[float, float, float]
+    axes: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    slopes: tuple[float, float]
+    near: float
+    kind: Literal["ndc"] = "ndc"
+    half: ClassVar[float] = REGION_HALF
+    bends_rays: ClassVar[bool] = False
+    unbounded: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        axes = np.array(self.axes)
+        if axes.shape != (3, 3) or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-6):
+            raise ValueError(f"the axes of the pyramid are {self.axes}; they must be three at right angles")
+        if not (np.isfinite(self.apex).all() and all(0 < each < math.inf for each in (*self.slopes, self.near))):
+            raise ValueError(
+                f"slopes {self.slopes} and near {self.near} must be positive numbers, apex {self.apex} finite"
+            )
+
+    def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+        """Of scene points; those before the near plane, or behind the apex, are far outside of the cube."""
+        x, y, z = self._local(points).unbind(-1)
+        inverse = 1 / z.clamp(min=MIN_DEPTH * self.near)
+        sideways = (each * inverse * (self.half / slope) for each, slope in zip((x, y), self.slopes, strict=True))
+        return torch.stack([*sideways, self.half * (1 - 2 * self.near * inverse)], -1)
+
+    def inverse(self, mapped: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+        """The scene points again, within the open cube; on its far face they are at infinity."""
+        x, y, z = mapped.unbind(-1)
+        depth = 2 * self.near / (1 - z / self.half)
+        sideways = (each * (slope / self.half) * depth for each, slope in zip((x, y), self.slopes, strict=True))
+        return torch.stack([*sideways, depth], -1) @ self._matrix(mapped) + mapped.new_tensor(self.apex)
+
+    def pull_back(
+        self, points: Float[Tensor, "*points 3"], grad: Float[Tensor, "*points 3"]
+    ) -> Float[Tensor, "*points 3"]:
+        """Gradients of scene points from those of mapped ones: with the transposed Jacobian of :meth:`forward`."""
+        x, y, z = self._local(points).unbind(-1)
+        least = MIN_DEPTH * self.near
+        inverse = 1 / z.clamp(min=least)
+        along_x, along_y = (grad[..., axis] * inverse * (self.half / slope) for axis, slope in enumerate(self.slopes))
+        forward = 2 * self.half * self.near * inverse * grad[..., 2] - along_x * x - along_y * y
+        along_z = torch.where(z < least, 0, forward * inverse)
+        return torch.stack([along_x, along_y, along_z], -1) @ self._matrix(grad)
+
+    def scene_length(self, mapped: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
+        """Length in the scene for a length in the cube along the line of sight from the apex, at mapped points within
+        the open cube."""
+        points = self.inverse(mapped) - mapped.new_tensor(self.apex)
+        depth = 2 * self.near / (1 - mapped[..., 2] / self.half)
+        return depth * points.norm(dim=-1) / (2 * self.half * self.near)
+
+    def map_rays(self, rays: Rays) -> MappedRays:
+        """Rays as straight lines through the cube, each from where it has passed the near plane, with distances of the
+        cube. What is behind that plane for good has no length."""
+        matrix = self._matrix(rays.origins)
+        origins, directions = (rays.origins - rays.origins.new_tensor(self.apex)) @ matrix.T, rays.directions @ matrix.T
+        slope = directions[..., 2]
+        with torch.no_grad():  # the interval says where to look, not what is seen
+            # Where it passes the near plane, be it to the front or to the back; nowhere if it runs along it.
+            passes = (self.near - origins[..., 2]) / torch.where(slope == 0, torch.finfo(slope.dtype).tiny, slope)
+            start = torch.where(slope > 0, torch.maximum(rays.near, passes), rays.near)
+            far = torch.where(slope < 0, torch.minimum(rays.far, passes), rays.far)
+        at_start = origins + start[..., None] * directions
+        # The plane is met to rounding: a ray that starts there starts in the cube.
+        depth = torch.where(start > rays.near, at_start[..., 2].clamp(min=self.near), at_start[..., 2])
+        seen = (start < far) & (depth >= self.near)
+        depth = depth.clamp(min=self.near)
+        at = self._projected(at_start[..., :2], depth)
+        scale = rays.origins.new_tensor([self.half / each for each in self.slopes])
+        towards = directions[..., :2] * scale - at[..., :2] * slope[..., None]
+        velocity = torch.cat([towards, ((self.half - at[..., 2]) * slope)[..., None]], -1)
+        speed = velocity.norm(dim=-1)
+        line = Line(torch.where(seen, start, rays.far), depth, slope, speed)
+        length = torch.where(seen, MappedRays(rays, line).from_scene(far), 0)
+        return MappedRays(Rays(at, velocity / speed[..., None], torch.zeros_like(length), length), line)
+
+    def _projected(
+        self, sideways: Float[Tensor, "*points 2"], depth: Float[Tensor, "*points"]
+    ) -> Float[Tensor, "*points 3"]:
+        scale = sideways.new_tensor([self.half / each for each in self.slopes])
+        return torch.cat(
+            [sideways * scale / depth[..., None], (self.half * (1 - 2 * self.near / depth))[..., None]], -1
+        )
+
+    def _matrix(self, like: Tensor) -> Float[Tensor, "3 3"]:
+        return like.new_tensor(self.axes)
+
+    def _local(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+        return (points - points.new_tensor(self.apex)) @ self._matrix(points).T
+
+
+SpaceMap = Box | Contraction | Ndc
+
+
+def space_map(kind: str, **parameters: Any) -> SpaceMap:
+    """A map by its kind and parameters, as ``dataclasses.asdict`` gives them. Raises ValueError for an unknown kind."""
+    maps = {"box": Box, "contraction": Contraction, "ndc": Ndc}
+    if kind not in maps:
+        raise ValueError(f"the space map is {kind!r}; it must be one of {', '.join(maps)}")
+    return maps[kind](**parameters)
+
+
+def enclosing_ndc(
+    poses: Float[np.ndarray, "views 3 4"],
+    borders: list[Float[np.ndarray, "_ 3"]],
+    near: Float[np.ndarray, "views"],
+) -> Ndc | None:
+    """The narrowest pyramid along the mean optical axis that holds all that the views see from their ``near`` (distance
+    along a unit ray) on.
+
+    ``poses`` are scene_from_camera; ``borders`` per view unit ray directions (camera frame) of its outline. None where
+    a ray runs more than MAX_ANGLE_DEG off the mean axis: these cameras do not face one way.
+    """
+    axes = _mean_axes(poses[:, :, :3].mean(0))
+    if axes is None:
+        return None
+    rays = [border @ (axes @ pose[:, :3]).T for border, pose in zip(borders, poses, strict=True)]
+    least = min(ray[:, 2].min() for ray in rays)
+    if least < math.cos(math.radians(MAX_ANGLE_DEG)):
+        return None
+    slopes = np.max([np.abs(ray[:, :2] / ray[:, 2:]).max(0) for ray in rays], axis=0)
+    centres = poses[:, :, 3] @ axes.T
+    # Along each side axis the pyramid's outline is a wedge; the deepest that holds all centres:
+    to_left, to_right = ((centres[:, 2:] + sign * centres[:, :2] / slopes).min(0) for sign in (1, -1))
+    apex = np.append(slopes * (to_left - to_right) / 2, ((to_left + to_right) / 2).min())
+    depth = min(
+        centre[2] - apex[2] + distance * ray[:, 2].min()
+        for centre, distance, ray in zip(centres, near, rays, strict=True)
+    )
+    right, down, forward = (_triple(axis) for axis in axes)
+    return Ndc(_triple(apex @ axes), (right, down, forward), (float(slopes[0]), float(slopes[1])), float(depth))
+
+
+def _triple(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
+    return float(values[0]), float(values[1]), float(values[2])
+
+
+def _mean_axes(mean: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"] | None:
+    """The camera axes, as rows, whose forward is that of the ``mean`` of rotations scene_from_camera, and whose right
+    is as near to its as can be; any where the photos were rolled every way. None where they look every way."""
+    length = np.linalg.norm(mean[:, 2])
+    if length < math.cos(math.radians(MAX_ANGLE_DEG)):
+        return None
+    forward = mean[:, 2] / length
+    for right in (mean[:, 0], np.eye(3)[np.abs(forward).argmin()]):
+        right = right - forward * (right @ forward)
+        if (length := np.linalg.norm(right)) > 1e-3:
+            right = right / length
+            return np.stack([right, np.cross(forward, right), forward])
+    return None
