@@ -1,12 +1,12 @@
 """The hash-grid field on a GPU: PSNR against seconds of training, where a step's time goes, and frames a second.
 
-    python -m benchmarks.gpu_field prepare WORKSPACE FILE
-    python -m benchmarks.gpu_field run FILE --photos FOLDER --seconds 10 30 [--profile] [--out JSON]
+    python -m benchmarks.gpu_dataset WORKSPACE FILE
+    python -m benchmarks.gpu_field FILE --photos FOLDER --seconds 10 30 [--profile] [--out JSON]
 
-``prepare`` needs a workspace whose stages are done up to normalise, and writes its rays; ``run`` needs torch, Warp and
-Pillow alone, so that a machine with a GPU needs nothing else. ``--photos`` is the folder of the workspace's own photos
-(``output/images``). Training starts afresh for each number of seconds, with the sizes a GPU has by default; the first
-steps, which compile kernels, are not counted.
+The first command writes the rays of a workspace; the second needs torch, Warp and Pillow alone, so that a machine
+with a GPU needs nothing else. ``--photos`` is the folder of the workspace's own photos (``output/images``). Training
+starts afresh for each number of seconds, with the sizes a GPU has by default; the first steps, which compile kernels,
+are not counted.
 """
 
 import argparse
@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from PIL import Image
 from safetensors import safe_open
-from safetensors.torch import save_file
 
 from benchmarks.record import Record, add_out
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
@@ -32,34 +31,8 @@ from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import over
 
 DEVICE = torch.device("cuda")
-SHOWN = {"ingest": "images", "normalise": "scene.json"}  # by what output/ links to, the folder of a stage
 TARGET_SAMPLES, LEARNING_RATE = 1 << 18, 2e-2  # of a step on a GPU, as stages/train chooses them
 WARMUP_STEPS, PROFILED_STEPS = 30, 20
-
-
-def prepare(workspace: Path, file: Path) -> None:
-    """Write what training needs of a workspace, but for the pixels of its photos."""
-    # Here alone: they read cameras by pycolmap, which the machine with the GPU may lack.
-    from stages.io.files import read_scene
-    from stages.train.data import guided_dataset, training_dataset
-
-    class Silent:
-        def update(self, message: str, done: float | None = None) -> None: ...
-        def note(self, message: str) -> None: ...
-
-    folders = {name: (workspace / "output" / shown).resolve().parent for name, shown in SHOWN.items()}
-    scene = read_scene(folders["normalise"])
-    train = guided_dataset(folders, scene, 1.0, Silent())
-    test = training_dataset(folders["ingest"], scene, "test", 1.0, Silent())
-    views = {split: [view.file for view in scene.of_split(split)] for split in ("train", "test")}
-    tables = {
-        f"{split}.{name}": table.contiguous()
-        for split, dataset in (("train", train), ("test", test))
-        for name, table in dataset._asdict().items()
-        if name != "pixels" and table is not None
-    }
-    facts = {"files": views, "alpha": scene.has_alpha, "bounded": scene.bounded}
-    save_file(tables, file, {"facts": json.dumps(facts)})
 
 
 def load(file: Path, photos: Path) -> tuple[dict[str, RayDataset], bool]:
@@ -86,7 +59,7 @@ def new_trainer(dataset: RayDataset, bounded: bool, target_samples: int) -> Hash
         sizes |= {"max_res": 2048, "base_res": 8, "contracted": True, "min_step_size": step, "cone_angle": step / 0.25}
     settings = HashGridSettings(**sizes, background_model=not bounded and not alpha)
     field = HashGridField(settings, 0, warp).to(DEVICE)
-    losses = {"depth_loss": 0.1} | ({} if bounded else {"distortion": 2e-3, "least_photos": 3})
+    losses: dict[str, Any] = {"depth_loss": 0.1} | ({} if bounded else {"distortion": 2e-3, "least_photos": 3})
     how = HashGridTrainerSettings(
         0, "random" if alpha else (0.0, 0.0, 0.0), target_samples, rate=LEARNING_RATE, **losses
     )
@@ -115,23 +88,23 @@ def train(trainer: HashGridTrainer, seconds: float) -> dict[str, float]:
 
 def score(field: HashGridField, dataset: RayDataset) -> dict[str, float]:
     """Mean PSNR (dB) of the test photos, and the seconds that one takes."""
-    white, values = torch.full((3,), float(dataset.pixels.shape[1] == 4), device=DEVICE), []
-    for view in (0, *range(len(dataset.near))):  # the first once more, beforehand: it compiles kernels
-        if len(values) == 1:
-            torch.cuda.synchronize()
-            started = time.perf_counter()
-        first, end = int(dataset.first_pixel[view]), int(dataset.first_pixel[view + 1])
-        width = int(dataset.layout[1, view])
-        rays, colour, alpha, _ = dataset.lookup(torch.arange(first, end, device=DEVICE))
-        whole = Rays(*(part.reshape(-1, width, *part.shape[1:]) for part in rays))
+    white = torch.full((3,), float(dataset.pixels.shape[1] == 4), device=DEVICE)
+
+    def psnr_of(view: int) -> float:
+        pixels = torch.arange(int(dataset.first_pixel[view]), int(dataset.first_pixel[view + 1]), device=DEVICE)
+        rays, colour, alpha, _ = dataset.lookup(pixels)
+        whole = Rays(*(part.reshape(-1, int(dataset.layout[1, view]), *part.shape[1:]) for part in rays))
         seen = render_image(field, whole, white).colour.clamp(0, 1)
-        values.append(psnr(mean_squared_error(seen, over(colour, alpha, white).view_as(seen))))
-    torch.cuda.synchronize()
-    seconds, frames = time.perf_counter() - started, len(values) - 1
+        return psnr(mean_squared_error(seen, over(colour, alpha, white).view_as(seen)))
+
+    psnr_of(0)  # compiles kernels
+    started, views = time.perf_counter(), len(dataset.near)
+    values = [psnr_of(view) for view in range(views)]
+    seconds = time.perf_counter() - started
     return {
-        "psnr": round(sum(values[1:]) / frames, 2),
-        "frame_ms": round(1000 * seconds / frames, 1),
-        "pixels_per_second": round(frames * (end - first) / seconds),
+        "psnr": round(sum(values) / views, 2),
+        "frame_ms": round(1000 * seconds / views, 1),
+        "pixels_per_second": round(int(dataset.first_pixel[views]) / seconds),
     }
 
 
@@ -146,7 +119,7 @@ def profile(trainer: HashGridTrainer, test: RayDataset, step: int) -> None:
         with torch.profiler.profile(activities=activities) as seen:
             run()
             torch.cuda.synchronize()
-        events = [event for event in seen.events() if event.device_type == torch.autograd.DeviceType.CUDA]
+        events = [event for event in seen.events() or [] if event.device_type.name == "CUDA"]
         totals: dict[str, tuple[float, int]] = {}
         for event in events:
             time_us, count = totals.get(event.name, (0.0, 0))
@@ -177,23 +150,14 @@ def run(given: argparse.Namespace) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(dest="command", required=True)
-    preparing = commands.add_parser("prepare")
-    preparing.add_argument("workspace", type=Path)
-    preparing.add_argument("file", type=Path)
-    running = commands.add_parser("run")
-    running.add_argument("file", type=Path)
-    running.add_argument("--photos", type=Path, required=True)
-    running.add_argument("--seconds", type=float, nargs="+", default=[10.0])
-    running.add_argument("--target-samples", type=int, default=TARGET_SAMPLES)
-    running.add_argument("--matmul", choices=("highest", "high", "medium"), default="highest")
-    running.add_argument("--profile", action="store_true", help="kernels of a step and of a frame, after the last run")
-    add_out(running)
-    given = parser.parse_args()
-    if given.command == "prepare":
-        prepare(given.workspace, given.file)
-    else:
-        run(given)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--photos", type=Path, required=True)
+    parser.add_argument("--seconds", type=float, nargs="+", default=[10.0])
+    parser.add_argument("--target-samples", type=int, default=TARGET_SAMPLES)
+    parser.add_argument("--matmul", choices=("highest", "high", "medium"), default="highest")
+    parser.add_argument("--profile", action="store_true", help="kernels of a step and of a frame, after the last run")
+    add_out(parser)
+    run(parser.parse_args())
 
 
 if __name__ == "__main__":

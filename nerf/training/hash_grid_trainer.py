@@ -154,6 +154,8 @@ class HashGridTrainer:
         self.exp_avg = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.exp_avg_sq = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.grad_table = torch.zeros_like(model.table)
+        if settings.background != "random":
+            self.fixed_background = torch.tensor(settings.background, device=dataset.device)
         self.samples_per_ray = torch.tensor(INITIAL_SAMPLES_PER_RAY, dtype=torch.float64)
         self.order = PixelSampler(self.dataset.unmasked_count, settings.seed, dataset.device)
         self.drawn = torch.tensor(0)  # pixels of that order so far; steps differ in how many they take
@@ -223,7 +225,7 @@ class HashGridTrainer:
         if self.settings.background == "random":
             background = torch.rand(count, 3, generator=random, device=device)
         else:
-            background = torch.tensor(self.settings.background, device=device).repeat(count, 1)
+            background = self.fixed_background.repeat(count, 1)
         target = colour if alpha is None else torch.lerp(background, colour, alpha[:, None])
         jitter, offset = torch.rand(2, count, generator=random, device=device)
         return HashGridBatch(rays, target, background, jitter, offset, view, distance)

@@ -1,5 +1,7 @@
 """Kernels in the form that a GPU runs, a few numbers a thread, agree with those of the CPU on a CPU as well."""
 
+from typing import Any
+
 import torch
 
 from nerf.kernels import grid_layout, warp
@@ -13,10 +15,14 @@ LAYOUT = grid_layout(3, 4, 32, 8, 4)
 COUNTS = [3, 0, 70, 1]
 
 
+def run(kernel: Any, count: int, *arguments: Any) -> None:
+    launch(kernel, count, *arguments)
+
+
 def test_encoding() -> None:
     points, table = uniform("cpu", 1, 99, 3), normal("cpu", 2, LAYOUT.rows, 4)
     lanes, levels = torch.empty(99, LAYOUT.width), encoding._levels(LAYOUT, points.device)
-    launch(encoding._encode_lanes, 3 * 99, levels, 3, table, points, lanes)
+    run(encoding._encode_lanes, 3 * 99, levels, 3, table, points, lanes)
     torch.testing.assert_close(lanes, warp.encode(LAYOUT, table, points))
 
 
@@ -25,7 +31,7 @@ def test_gradients_of_the_table() -> None:
     wanted, found = torch.zeros(LAYOUT.rows, 4), torch.zeros(LAYOUT.rows, 4)
     warp.encode_backward_table(LAYOUT, range(1, 3), points, grad, wanted)
     levels = encoding._levels(LAYOUT, points.device)
-    launch(encoding._encode_backward_table_lanes, 2 * 99, levels, 3, 1, 99, points, grad, found)
+    run(encoding._encode_backward_table_lanes, 2 * 99, levels, 3, 1, 99, points, grad, found)
     torch.testing.assert_close(found, wanted)
     assert wanted.any() and not wanted[: LAYOUT.first_rows[1]].any()
 
@@ -36,13 +42,13 @@ def test_hidden_layer() -> None:
     hidden[5, 7] = torch.nan
     by_lanes, its_grad = hidden.clone(), grad.clone()
     warp.add_ray_relu(samples, hidden, of_ray)
-    launch(hidden_layer._add_ray_relu_lanes, 16 * len(hidden), samples.ray, of_ray, by_lanes)
+    run(hidden_layer._add_ray_relu_lanes, 16 * len(hidden), samples.ray, of_ray, by_lanes)
     torch.testing.assert_close(by_lanes, hidden, rtol=0, atol=0, equal_nan=True)
     hidden[5, 7] = 1.0
     wanted, found = warp.add_ray_relu_backward(samples, hidden, grad), torch.empty(len(COUNTS), 64)
-    launch(hidden_layer._add_ray_relu_backward_lanes, 16 * len(found), samples.starts, hidden, its_grad, found)
+    run(hidden_layer._add_ray_relu_backward_lanes, 16 * len(found), samples.starts, hidden, its_grad, found)
     torch.testing.assert_close((found, its_grad), (wanted, grad))
-    launch(hidden_layer._relu_backward_lanes, 16 * len(hidden), hidden, (again := normal("cpu", 5, len(hidden), 64)))
+    run(hidden_layer._relu_backward_lanes, 16 * len(hidden), hidden, (again := normal("cpu", 5, len(hidden), 64)))
     torch.testing.assert_close(again, grad)
 
 
@@ -52,12 +58,12 @@ def test_adam() -> None:
     state = [normal("cpu", 8, 40, 4), gradient, normal("cpu", 9, 40, 4), uniform("cpu", 10, 40, 4)]
     found = [tensor.clone() for tensor in state]
     warp.adam(*state, learning_rate=0.1, step=1)
-    launch(_adam4, 40, 0.1 / (1 - BETA1), 1 / (1 - BETA2), *found)
+    run(_adam4, 40, 0.1 / (1 - BETA1), 1 / (1 - BETA2), *found)
     torch.testing.assert_close(found, state, equal_nan=True)
 
 
 def test_gathering_rows() -> None:
     values, rows = normal("cpu", 11, 20, 12), torch.tensor([3, 19, 0, 3], dtype=torch.int32)
     gathered = torch.empty(4, 12)
-    launch(gather._gather_rows, 4 * 3, 3, values, rows, gathered)
+    run(gather._gather_rows, 4 * 3, 3, values, rows, gathered)
     assert torch.equal(gathered, values[rows.long()])
