@@ -35,12 +35,13 @@ from stages.hardware.device import compute_device
 from stages.io.files import read_json, read_scene
 from stages.train import Config
 from stages.train.data import field_background, guided_dataset, training_dataset
-from stages.train.fields import field_of, make_trainer, with_defaults
+from stages.train.fields.field_list import field_of, make_trainer, with_defaults
+from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.planning import chosen_downscale
 
 BUDGETS = (125, 250, 500, 1000, 2000)
 ONCE = 1000  # steps that draw every pixel of the training photos once: it is their number that gives the photos' size
-CHUNKS = 2
+MICRO_BATCHES = 2
 PROBE_RAYS = 2048
 PER_DOUBLING = 2  # measurements
 FIRST = 32  # steps
@@ -77,11 +78,9 @@ def bench_of(workspace: Path) -> Bench:
     scene, decisions = read_scene(inputs["normalise"]), read_decisions(inputs["effects"])
     config = with_defaults(
         Config(
-            field="grid",
             contracted="background" in decisions.on,
             view_dependence="view_dependence" in decisions.on,
-            backend=chosen_backend(compute_device(), Quiet()),
-            chunks=CHUNKS,
+            grid=HashGridOptions(backend=chosen_backend(compute_device(), Quiet()), micro_batches=MICRO_BATCHES),
         )
     )
     rays = ONCE * field_of(config).rays_per_step(config)
@@ -133,7 +132,7 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
                 mean.add(step + 1)
         if step + 1 in due:
             as_expected = trainer.effects.of_held_out(bench.held_out)
-            models = {"heldout_psnr": trainer.model} | {name: mean.model for name, mean in means.items()}
+            models = {"probe_psnr": trainer.model} | {name: mean.model for name, mean in means.items()}
             psnr = {name: measure(model, bench.probe, as_expected).psnr for name, model in models.items()}
             points.append({"step": step + 1, "train_psnr": pace, **psnr})
     return {"rays": rays, "pixels": bench.dataset.unmasked_count, "points": points}
@@ -159,11 +158,11 @@ def main() -> None:
             if any(run.items() <= made.items() for made in runs):
                 continue
             bench = bench or bench_of(workspace)
-            load_backend(bench.config.backend or "warp", compute_device(), Quiet())
+            load_backend(bench.config.grid.backend or "warp", compute_device(), Quiet())
             clock = time.process_time()
             run |= train_run(bench, seed, steps, given.schedule)
             last = run["points"][-1]
-            psnr = " ".join(f"{name} {last[name]:.2f}" for name in ("train_psnr", "heldout_psnr", *MEANS))
+            psnr = " ".join(f"{name} {last[name]:.2f}" for name in ("train_psnr", "probe_psnr", *MEANS))
             what = f"{workspace.stem} {seed} {steps} {given.schedule} {given.constant}"
             print(what, psnr, f"{time.process_time() - clock:.0f} s", flush=True)
             runs.append(run)

@@ -12,11 +12,11 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
-from tyro.conf import Suppress
 
 from nerf.geometry.scene import Scene
 from stages.amounts import duration, short_count
 from stages.contract import Inputs
+from stages.evaluate.summary import scored_on
 from stages.io.ascii_names import shell_quoted
 from stages.io.files import read_json, read_scene, read_tensors
 from stages.io.pixels import load_pixels, pillow
@@ -31,7 +31,7 @@ from stages.report.cameras import (
     uncertainty,
 )
 from stages.report.effects import effects_table
-from stages.report.plots import ORDER_COLOURS, camera_svgs, curve_svg
+from stages.report.plots import ORDER_COLOURS, Score, camera_svgs, curve_svg
 from stages.report.profile import parts_bar
 from stages.tradeoff.plots import COLUMNS, plot_svg, rendering_sentence, table_cells
 from stages.train.curve import coming_doubling, doubling_words, knee_words, more_option, ssim_words
@@ -106,6 +106,7 @@ def summarise(results: Results) -> dict[str, Any]:
         "expected_seconds": _expected(manifests),
         "training_parts": results.parts,
         **{key: metrics.get(key) for key in ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")},
+        "scored_fraction": metrics.get("fraction"),
         "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
         "verdict": metrics.get("verdict", "Not measured: stage evaluate has not run."),
     }
@@ -147,6 +148,7 @@ def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
         curve=_curve(results),
         parts=parts_bar(results.parts),
         metrics=results.metrics,
+        scored_on=scored_on(results.metrics) if results.metrics and results.metrics["images"] else None,
         compared=_compared(results),
         video=_video(results.inputs, config.video_limit_mb),
         **_mesh_part(results),
@@ -195,12 +197,14 @@ def _run_part(results: Results, summary: dict[str, Any], config: "Config") -> di
 
 def _settings(manifests: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """Every option that has a flag, by its flag, in the order of the stages."""
-    return {
-        f"--{stage}.{name.replace('_', '-')}": manifests[stage]["config"].get(name)
-        for stage in manifests
-        for name, field in sorted(import_module(f"stages.{stage}").Config.model_fields.items())
-        if Suppress not in field.metadata
-    }
+    settings = {}
+    for stage in manifests:
+        for name, _ in sorted(import_module(f"stages.{stage}").Config.flags()):
+            *group, option = name.split(".")
+            values = manifests[stage]["config"]
+            if (table := values.get(group[0]) if group else values) is not None:
+                settings[f"--{stage}.{name.replace('_', '-')}"] = table.get(option)
+    return settings
 
 
 def _workspace(inputs: Inputs) -> str:
@@ -265,7 +269,9 @@ def _curve(results: Results) -> dict[str, Any] | None:
     points, metrics = results.curve["points"], results.metrics or {}
     baselines = {"nearest training view": "psnr_nearest_view", "mean image": "psnr_mean_image"}
     coming = coming_doubling(results.curve["field"], results.curve["whole"], points)
-    svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming)
+    scored = metrics.get("psnr") is not None
+    score = Score(metrics["psnr"], metrics["psnr_interval"]) if scored else None
+    svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming, score)
     if svg is None:
         return None
     words = [doubling_words(points, coming), knee_words(points), ssim_words(points)]
