@@ -23,6 +23,7 @@ from safetensors import safe_open
 from benchmarks.record import Record, add_out
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.rays import Rays
+from nerf.geometry.space_maps import Contraction
 from nerf.kernels import warp
 from nerf.rendering.images import render_image
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
@@ -56,12 +57,18 @@ def new_trainer(dataset: RayDataset, bounded: bool, target_samples: int) -> Hash
         sizes |= {"max_res": 1024, "diagonal_steps": 576}
     else:
         step = 4 / (1.5 * 2048)
-        sizes |= {"max_res": 2048, "base_res": 8, "contracted": True, "min_step_size": step, "cone_angle": step / 0.25}
+        sizes |= {
+            "max_res": 2048,
+            "base_res": 8,
+            "space": Contraction(),
+            "min_step_size": step,
+            "cone_angle": step / 0.25,
+        }
     settings = HashGridSettings(**sizes, background_model=not bounded and not alpha)
     field = HashGridField(settings, 0, warp).to(DEVICE)
-    losses: dict[str, Any] = {"depth_loss": 0.1} | ({} if bounded else {"distortion": 2e-3, "least_photos": 3})
+    losses: dict[str, Any] = {"depth_weight": 0.1} | ({} if bounded else {"distortion_weight": 2e-3, "min_photos": 3})
     how = HashGridTrainerSettings(
-        0, "random" if alpha else (0.0, 0.0, 0.0), target_samples, rate=LEARNING_RATE, **losses
+        0, "random" if alpha else (0.0, 0.0, 0.0), target_samples, learning_rate=LEARNING_RATE, **losses
     )
     return HashGridTrainer(field, dataset, how)
 
@@ -71,17 +78,18 @@ def train(trainer: HashGridTrainer, seconds: float) -> dict[str, float]:
     for step in range(WARMUP_STEPS):
         trainer.step(step, 0.0)
     torch.cuda.synchronize()
-    started, step, rays, samples, densities = time.perf_counter(), WARMUP_STEPS, 0, 0, 0
+    started, step, rays, colours, densities = time.perf_counter(), WARMUP_STEPS, 0, 0, 0
     while (elapsed := time.perf_counter() - started) < seconds:
         done = trainer.step(step, elapsed / seconds)
-        step, rays, samples, densities = step + 1, rays + done.rays, samples + done.samples, densities + done.densities
+        step, rays = step + 1, rays + done.rays
+        colours, densities = colours + done.colour_evaluations, densities + done.density_evaluations
     torch.cuda.synchronize()
     elapsed, steps = time.perf_counter() - started, step - WARMUP_STEPS
     return {
         "steps": steps,
         "step_ms": round(1000 * elapsed / steps, 2),
         "rays_per_second": round(rays / elapsed),
-        "colours_per_ray": round(samples / rays, 1),
+        "colours_per_ray": round(colours / rays, 1),
         "densities_per_ray": round(densities / rays, 1),
     }
 
@@ -93,7 +101,7 @@ def score(field: HashGridField, dataset: RayDataset) -> dict[str, float]:
     def psnr_of(view: int) -> float:
         pixels = torch.arange(int(dataset.first_pixel[view]), int(dataset.first_pixel[view + 1]), device=DEVICE)
         rays, colour, alpha, _ = dataset.lookup(pixels)
-        whole = Rays(*(part.reshape(-1, int(dataset.layout[1, view]), *part.shape[1:]) for part in rays))
+        whole = Rays(*(part.reshape(-1, int(dataset.view_layout[1, view]), *part.shape[1:]) for part in rays))
         seen = render_image(field, whole, white).colour.clamp(0, 1)
         return psnr(mean_squared_error(seen, over(colour, alpha, white).view_as(seen)))
 
@@ -111,7 +119,7 @@ def score(field: HashGridField, dataset: RayDataset) -> dict[str, float]:
 def profile(trainer: HashGridTrainer, test: RayDataset, step: int) -> None:
     """Print the kernels that take most of a step, and of a rendered photo, with the host's share of both."""
     activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
-    one_photo = test._replace(first_pixel=test.first_pixel[:2], geometry=test.geometry[:, :1])
+    one_photo = test._replace(first_pixel=test.first_pixel[:2], view_geometry=test.view_geometry[:, :1])
     for name, runs, run in (
         ("step", PROFILED_STEPS, lambda: [trainer.step(step + each, 0.9) for each in range(PROFILED_STEPS)]),
         ("frame", 1, lambda: score(trainer.model, one_photo)),

@@ -33,7 +33,7 @@ def test_gradients_of_the_table() -> None:
     levels = encoding._levels(LAYOUT, points.device)
     run(encoding._encode_backward_table_lanes, 2 * 99, levels, 3, 1, 99, points, grad, found)
     torch.testing.assert_close(found, wanted)
-    assert wanted.any() and not wanted[: LAYOUT.first_rows[1]].any()
+    assert wanted.any() and not wanted[: LAYOUT.level_offsets[1]].any()
 
 
 def test_hidden_layer() -> None:
