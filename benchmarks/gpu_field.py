@@ -29,7 +29,7 @@ from nerf.rendering.images import render_image
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from nerf.training.metrics import mean_squared_error, psnr
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.trainer import over
+from nerf.training.trainer import composite_over
 
 DEVICE = torch.device("cuda")
 TARGET_SAMPLES, LEARNING_RATE = 1 << 18, 2e-2  # of a step on a GPU, as stages/train chooses them
@@ -103,7 +103,7 @@ def score(field: HashGridField, dataset: RayDataset) -> dict[str, float]:
         rays, colour, alpha, _ = dataset.lookup(pixels)
         whole = Rays(*(part.reshape(-1, int(dataset.view_layout[1, view]), *part.shape[1:]) for part in rays))
         seen = render_image(field, whole, white).colour.clamp(0, 1)
-        return psnr(mean_squared_error(seen, over(colour, alpha, white).view_as(seen)))
+        return psnr(mean_squared_error(seen, composite_over(colour, alpha, white).view_as(seen)))
 
     psnr_of(0)  # compiles kernels
     started, views = time.perf_counter(), len(dataset.near)
