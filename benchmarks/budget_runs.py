@@ -35,12 +35,13 @@ from stages.hardware.device import compute_device
 from stages.io.files import read_json, read_scene
 from stages.train import Config
 from stages.train.data import field_background, guided_dataset, training_dataset
-from stages.train.fields import field_of, make_trainer, with_defaults
+from stages.train.fields.field_list import field_of, make_trainer, with_defaults
+from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.planning import chosen_downscale
 
 BUDGETS = (125, 250, 500, 1000, 2000)
 ONCE = 1000  # steps that draw every pixel of the training photos once: it is their number that gives the photos' size
-CHUNKS = 2
+MICRO_BATCHES = 2
 PROBE_RAYS = 2048
 PER_DOUBLING = 2  # measurements
 FIRST = 32  # steps
@@ -77,11 +78,9 @@ def bench_of(workspace: Path) -> Bench:
     scene, decisions = read_scene(inputs["normalise"]), read_decisions(inputs["effects"])
     config = with_defaults(
         Config(
-            field="grid",
             contracted="background" in decisions.on,
             view_dependence="view_dependence" in decisions.on,
-            backend=chosen_backend(compute_device(), Quiet()),
-            chunks=CHUNKS,
+            grid=HashGridOptions(backend=chosen_backend(compute_device(), Quiet()), micro_batches=MICRO_BATCHES),
         )
     )
     rays = ONCE * field_of(config).rays_per_step(config)
@@ -159,7 +158,7 @@ def main() -> None:
             if any(run.items() <= made.items() for made in runs):
                 continue
             bench = bench or bench_of(workspace)
-            load_backend(bench.config.backend or "warp", compute_device(), Quiet())
+            load_backend(bench.config.grid.backend or "warp", compute_device(), Quiet())
             clock = time.process_time()
             run |= train_run(bench, seed, steps, given.schedule)
             last = run["points"][-1]

@@ -92,7 +92,7 @@ def figures(workspace: Path, case: Case, memory_gb: float) -> dict[str, Any]:
         "set": case.name,
         "downscale": case.downscale,
         "seconds": case.seconds,
-        "grids": f"{field['levels']} × 2^{field['log2_rows']} to {field['finest']}",
+        "grids": f"{field['num_levels']} × 2^{field['log2_hashmap_size']} to {field['max_res']}",
         **{name: facts[name] for name in ("steps", "rays_per_second", "samples_per_second")},
         "psnr": metrics["psnr"],
         "ssim": metrics["ssim"],

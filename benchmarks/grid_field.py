@@ -76,9 +76,9 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--downscale", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=60)
-    parser.add_argument("--levels", type=int, default=5)
-    parser.add_argument("--log2-rows", type=int, default=18)
-    parser.add_argument("--finest", type=int, default=384)
+    parser.add_argument("--num-levels", type=int, default=5)
+    parser.add_argument("--log2-hashmap-size", type=int, default=18)
+    parser.add_argument("--max-res", type=int, default=384)
     parser.add_argument("--steps", type=int, default=384)
     parser.add_argument("--samples", type=int, default=1 << 14)
     parser.add_argument("--backend", choices=("warp", "torch"), default="warp")
@@ -91,7 +91,9 @@ def main() -> None:
     record = Record(given.out)
     print(f"{torch.get_num_threads()} threads")
     take_over_cores()
-    settings = HashGridSettings(given.levels, 4, given.log2_rows, 16, given.finest, diagonal_steps=given.steps)
+    settings = HashGridSettings(
+        given.num_levels, 4, given.log2_hashmap_size, 16, given.max_res, diagonal_steps=given.steps
+    )
     train = read_dataset(given.folder, "train", given.downscale, 1)
     test = read_dataset(given.folder, "test", given.downscale, given.test_every)
     model = HashGridField(settings, given.seed, fast if given.backend == "warp" else reference)

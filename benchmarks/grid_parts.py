@@ -28,7 +28,7 @@ from stages.hardware.device import compute_device, cores
 from stages.io.files import read_scene
 from stages.train import Config, plan
 from stages.train.data import guided_dataset
-from stages.train.fields import field_of, make_trainer
+from stages.train.fields.field_list import field_of, make_trainer
 from stages.train.profile import FIRST_TIMED, RATES_SECONDS, observed, parts_table
 
 LINKED = {"ingest": "photos.json", "normalise": "scene.json", "effects": "effects.json"}
@@ -65,7 +65,7 @@ def main() -> None:
         set=given.photos.name,
         downscale=config.downscale,
         seconds=given.seconds,
-        colours_per_step=config.batch_samples,
+        colours_per_step=config.grid.target_samples,
         step_ms=round(1e3 * table["seconds"] / TIMED_STEPS, 1),
         at_machine_rates_percent=round(100 * table["floor_share"]),
         **{f"{row['part']}_percent": round(100 * row["share"]) for row in table["parts"]},
@@ -86,8 +86,12 @@ def loaded(workspace: Path, asked: Config) -> tuple[Config, Scene, RayDataset, D
     inputs = {stage: stage_folder(workspace, output) for stage, output in LINKED.items()}
     scene, config = read_scene(inputs["normalise"]), plan(asked, inputs, Spoken())
     assert config.downscale, "plan() chooses it"
-    sizes = f"{config.levels} grids of 2^{config.log2_rows} rows to {config.finest}³, photos at 1/{config.downscale:g}"
-    of_step = f"{config.batch_samples:,} colours in a step of {config.chunks} parts, {cores()} cores at work"
+    grid = config.grid
+    sizes = f"{grid.num_levels} grids of 2^{grid.log2_hashmap_size} rows to {grid.max_res}³"
+    sizes += f", photos at 1/{config.downscale:g}"
+    of_step = (
+        f"{grid.target_samples:,} colours in a step of {grid.micro_batches} micro-batches, {cores()} cores at work"
+    )
     print(f"{sizes}, {of_step}", flush=True)
     dataset = guided_dataset(inputs, scene, config.downscale, Spoken()).to(compute_device())
     return config, scene, dataset, read_decisions(inputs["effects"])

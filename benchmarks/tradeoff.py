@@ -11,9 +11,9 @@ import argparse
 from pathlib import Path
 
 from benchmarks.record import Record, add_out
-from pipeline.cli.display import PlainDisplay
 from pipeline.cli.durations import seconds_from
-from pipeline.cli.settings import with_source
+from pipeline.cli.options import with_source
+from pipeline.cli.terminal import PlainDisplay
 from pipeline.engine.runner import Runner
 from pipeline.engine.settings import Settings
 from pipeline.engine.stage_list import needed_for

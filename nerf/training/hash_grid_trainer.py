@@ -1,4 +1,4 @@
-"""One optimisation step of a hash-grid field, behind the same interface as the paper's (nerf/training/trainer.py)."""
+"""One optimisation step of a hash-grid field, behind the interface that all fields share (nerf/training/trainer.py)."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

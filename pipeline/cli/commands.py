@@ -12,10 +12,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from pipeline.cli import arguments, exit_codes
-from pipeline.cli.display import Unread, choose_display, open_closed_streams
 from pipeline.cli.durations import seconds_from
 from pipeline.cli.more import with_more
-from pipeline.cli.settings import (
+from pipeline.cli.options import (
     UsageError,
     check_fitted_poses,
     check_same_photos,
@@ -27,6 +26,7 @@ from pipeline.cli.settings import (
     with_source,
 )
 from pipeline.cli.signals import Terminated, go_on, heed_signals
+from pipeline.cli.terminal import Unread, choose_display, open_closed_streams
 from pipeline.engine import machine, stage_list, status
 from pipeline.engine.display import Display, SilentDisplay
 from pipeline.engine.failures import StageFailed

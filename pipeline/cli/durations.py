@@ -2,7 +2,7 @@
 
 import re
 
-from pipeline.cli.settings import UsageError
+from pipeline.cli.options import UsageError
 
 # Hours, minutes, seconds in this order, each at most once; the last may have decimals.
 _WRITTEN = re.compile(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s)?")

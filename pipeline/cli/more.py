@@ -4,7 +4,7 @@ import re
 from typing import Any
 
 from pipeline.cli.durations import seconds_from
-from pipeline.cli.settings import UsageError
+from pipeline.cli.options import UsageError
 from pipeline.engine.manifests import BadManifest, Manifest
 from pipeline.engine.settings import Settings
 from pipeline.engine.stage_list import command_that_makes

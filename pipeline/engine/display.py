@@ -1,4 +1,4 @@
-"""How the runner reports what it does; the displays of the command line (pipeline/cli/display.py) are such."""
+"""How the runner reports what it does; the displays of the command line (pipeline/cli/terminal.py) are such."""
 
 from pathlib import Path
 from typing import Protocol

@@ -52,7 +52,7 @@ def load_backend(name: BackendName, device: str, progress: Progress | None = Non
 
         return reference
     if why := why_not_warp(device):
-        raise StageError("hardware.no-warp", "cannot use the Warp kernels", why, "Use --train.backend torch.")
+        raise StageError("hardware.no-warp", "cannot use the Warp kernels", why, "Use --train.grid.backend torch.")
     from nerf.kernels import warp as kernels
 
     if progress:
@@ -61,7 +61,10 @@ def load_backend(name: BackendName, device: str, progress: Progress | None = Non
         kernels.compile_kernels(device)
     except OSError as error:
         raise StageError(
-            "hardware.kernel-cache", "cannot use the Warp kernels", _not_kept(error), "Or use --train.backend torch."
+            "hardware.kernel-cache",
+            "cannot use the Warp kernels",
+            _not_kept(error),
+            "Or use --train.grid.backend torch.",
         ) from error
     return kernels
 

@@ -21,13 +21,15 @@ _Spelling = tuple[str, str | None]
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """Finds files in the first of ``folders`` that has them. What lies in a folder is listed once at most.
+    """Finds files in the first of ``folders`` that has them. Each photo is looked for once; what lies in a folder is
+    listed once at most.
 
     ``of_other_folders``: the names are of another machine or folder, and only their ends tell which files are meant.
     """
 
     folders: tuple[Path, ...]
     of_other_folders: bool = False
+    _photos: dict[tuple[str, ...], Path] = field(default_factory=dict, init=False)
     _listed: dict[Path, dict[_Spelling, list[str]]] = field(default_factory=dict, init=False)
     _by_last: dict[str, list[Path]] = field(default_factory=dict, init=False)
 
@@ -37,7 +39,12 @@ class FrameFiles:
         Where the first folder is a reduction of the one that it names, as ``images_4`` of ``images/0.png``, its smaller
         copy. One that is nowhere is returned as if it were in the first folder, and rejected when it is to be decoded.
         """
-        name, *copies = photo_names(frame)
+        names = photo_names(frame)
+        if names not in self._photos:
+            self._photos[names] = self._photo(*names)
+        return self._photos[names]
+
+    def _photo(self, name: str, *copies: str) -> Path:
         if (reduced := self._reduced(name)) is not None and reduced.is_file():
             return reduced
         file = self._file(name, self.folders, "photo")

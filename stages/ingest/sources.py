@@ -232,13 +232,12 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
 def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
     place = cameras.parent if cameras.is_file() else cameras
     find = FrameFiles((root,) if place == root else (root, root.parent, place))
-    frames = _frames(cameras, find)
-    if not any(find.photo(frame).is_file() for frame in frames):
-        find = replace(find, of_other_folders=True)
-        frames = _frames(cameras, find)
-    files = {frame["file_path"]: find.photo(frame) for frame in frames}
+    frames, files = _frames(cameras, find)
     if not any(map(Path.is_file, files.values())):
-        raise _none_of_its_photos(cameras, root, list(files))
+        find = replace(find, of_other_folders=True)
+        frames, files = _frames(cameras, find)
+        if not any(map(Path.is_file, files.values())):
+            raise _none_of_its_photos(cameras, root, list(files))
     in_order = _sorted_inside(root, set(files.values()))
     photos = {path: _name(root, file) for path, file in files.items()}
     # In a file of ours they are of ingest's copies: those that lie with the photos count.
@@ -248,9 +247,11 @@ def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
     return Source(kind, root, cameras, in_order, photos, masks)
 
 
-def _frames(cameras: Path, find: FrameFiles) -> list[dict[str, Any]]:
+def _frames(cameras: Path, find: FrameFiles) -> tuple[list[dict[str, Any]], dict[str, Path]]:
+    """The frames of transforms files, and the photo of each by its ``file_path``."""
     splits, _ = read_splits(cameras, lambda frame: find.photo(frame).is_file())
-    return [frame for _, content in splits for frame in content["frames"]]
+    frames = [frame for _, content in splits for frame in content["frames"]]
+    return frames, {frame["file_path"]: find.photo(frame) for frame in frames}
 
 
 def _none_of_its_photos(cameras: Path, root: Path, names: list[str]) -> StageError:

@@ -12,7 +12,6 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
-from tyro.conf import Suppress
 
 from nerf.geometry.scene import Scene
 from stages.amounts import duration, short_count
@@ -195,12 +194,14 @@ def _run_part(results: Results, summary: dict[str, Any], config: "Config") -> di
 
 def _settings(manifests: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """Every option that has a flag, by its flag, in the order of the stages."""
-    return {
-        f"--{stage}.{name.replace('_', '-')}": manifests[stage]["config"].get(name)
-        for stage in manifests
-        for name, field in sorted(import_module(f"stages.{stage}").Config.model_fields.items())
-        if Suppress not in field.metadata
-    }
+    settings = {}
+    for stage in manifests:
+        for name, _ in sorted(import_module(f"stages.{stage}").Config.flags()):
+            *group, option = name.split(".")
+            values = manifests[stage]["config"]
+            if (table := values.get(group[0]) if group else values) is not None:
+                settings[f"--{stage}.{name.replace('_', '-')}"] = table.get(option)
+    return settings
 
 
 def _workspace(inputs: Inputs) -> str:

@@ -1,6 +1,6 @@
 """curve.json: quality against training time, and what it says in words.
 
-``{"field": "grid" | "paper", "downscale", "device": "cpu" | "cuda", "threads", "whole", "points": [{"step", "seconds",
+``{"field", "downscale", "device": "cpu" | "cuda", "threads", "whole", "points": [{"step", "seconds",
 "train_psnr", "heldout_psnr", "heldout_ssim"} …]}``; what cannot be measured is null. ``downscale`` is that of the
 photos, those measured on included. Seconds are those of training steps alone: measuring is not among them. ``whole``:
 the rate fell once, at the end, and never rose again to go on.
@@ -14,12 +14,13 @@ from nerf.training.learning_curve import KNEE_DB, Gain, knee, last_doubling, nex
 from stages.amounts import duration, duration_option
 from stages.hardware.device import compute_device, cores
 from stages.io.files import write_json
+from stages.train.config import OPTIONS_OF_FIELD, FieldName
 
 BARS = "▁▂▃▄▅▆▇█"
 SPARK_WIDTH = 10
 
 
-def write_curve(folder: Path, field: str, downscale: float, whole: bool, points: list[dict[str, Any]]) -> None:
+def write_curve(folder: Path, field: FieldName, downscale: float, whole: bool, points: list[dict[str, Any]]) -> None:
     """Write curve.json of a run that ends on this machine."""
     about = {"field": field, "downscale": downscale, "device": compute_device(), "threads": cores(), "whole": whole}
     write_json(folder / "curve.json", about | {"points": points})
@@ -31,11 +32,12 @@ def heldout_curve(points: Sequence[dict[str, Any]]) -> list[tuple[float, float]]
     return [(seconds, psnr) for seconds, psnr in known if psnr is not None and seconds > 0]
 
 
-def coming_doubling(field: str, whole: bool, points: Sequence[dict[str, Any]]) -> Gain | None:
+def coming_doubling(field: FieldName, whole: bool, points: Sequence[dict[str, Any]]) -> Gain | None:
     """What the next doubling of the time is predicted to buy at the same sizes of photos and field, as ``--more`` keeps
-    them; None where the curve is too short, and for what the prediction was not fitted to: the paper's field, whose
-    rate falls all the way, and a run that is not ``whole``, where half of the time may have ended annealed, too."""
-    return next_doubling(heldout_curve(points), points[-1]["step"]) if points and field == "grid" and whole else None
+    them; None where the curve is too short, and for what the prediction was not fitted to: another field than the hash
+    grid, and a run that is not ``whole``, where half of the time may have ended annealed, too."""
+    fitted = whole and OPTIONS_OF_FIELD[field].predicts_gains
+    return next_doubling(heldout_curve(points), points[-1]["step"]) if points and fitted else None
 
 
 def doubling_words(points: Sequence[dict[str, Any]], coming: Gain | None) -> str | None:

@@ -4,10 +4,10 @@ A training is named ``<key>/<digest>``: the first KEY_LENGTH digits of its key, 
 workspace, and of the digest of its outputs. So the name says what was trained and not where it lies.
 """
 
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any
 
-from stages.contract import KEY_LENGTH, Inputs, StageError
+from stages.contract import KEY_LENGTH, Inputs, Options, StageError
 from stages.io.files import read_json
 from stages.train.config import Config
 from stages.train.state import TrainingBudget
@@ -56,16 +56,23 @@ def continued(config: Config, inputs: Inputs) -> Config:
     assert config.after is not None
     manifest = read_json(earlier_training(config.after, inputs) / "manifest.json")
     _same_inputs(manifest["inputs"], inputs)
-    settings: dict[str, Any] = manifest["config"]
-    given = {name: value for name, value in config.model_dump(mode="json").items() if value is not None}
-    free = {*FREE, "target_psnr"} if settings["target_psnr"] is not None else FREE
-    for name, value in given.items():
-        if name not in free and value != settings.get(name):
-            why = f"{name} is {value} now and was {settings.get(name)}"
-            raise StageError("train.other-settings", "training cannot go on with other settings", why, ANEW)
+    before = Config.model_validate(manifest["config"])
+    free = {*FREE, "target_psnr"} if before.target_psnr is not None else {*FREE}
+    if (why := next(_changes(config, before, free), None)) is not None:
+        raise StageError("train.other-settings", "training cannot go on with other settings", why, ANEW)
     own = {name: getattr(config, name) for name in (*OWN, "checkpoint_seconds", "tensorboard")}
-    target = {"target_psnr": config.target_psnr or settings["target_psnr"]}
-    return Config.model_validate(settings | own | target)
+    target = {"target_psnr": config.target_psnr or before.target_psnr}
+    return Config.model_validate(manifest["config"] | own | target)
+
+
+def _changes(now: Options, before: Options, free: Collection[str] = (), prefix: str = "") -> Iterator[str]:
+    """In words, every option but the ``free`` ones that is given ``now`` and was another ``before``."""
+    for name in type(now).model_fields.keys() - {*free}:
+        value, was = getattr(now, name), getattr(before, name)
+        if isinstance(value, Options):
+            yield from _changes(value, was, prefix=f"{name}.")
+        elif value is not None and value != was:
+            yield f"{prefix}{name} is {value} now and was {was}"
 
 
 def _same_inputs(digests: dict[str, str], inputs: Inputs) -> None:

@@ -21,7 +21,7 @@ from stages.io.files import read_json, read_scene
 from stages.io.photos import read_photos
 from stages.train.config import SECONDS, Config
 from stages.train.data import MIN_LONG_SIDE, camera_directions
-from stages.train.fields import field_of, make_trainer
+from stages.train.fields.field_list import field_of, make_trainer
 from stages.train.more import continued, earlier_training
 from stages.train.precision import chosen_precision
 

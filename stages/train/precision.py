@@ -12,7 +12,7 @@ from nerf.runtime.matmul_precision import Medium, Precision, measure_medium_matm
 from stages.contract import Progress
 from stages.hardware.device import compute_device
 from stages.train.config import Config
-from stages.train.fields import field_of
+from stages.train.fields.field_list import field_of
 
 
 def chosen_precision(config: Config, progress: Progress) -> Precision:

@@ -17,7 +17,7 @@ from nerf.runtime.profiler import Profiler, WorkCounts, profiling
 from nerf.training.trainer import StepResult
 from stages.io.files import write_json
 from stages.train.config import Config
-from stages.train.fields import field_of
+from stages.train.fields.field_list import field_of
 
 TIMED_EVERY, FIRST_TIMED = 32, 8  # steps: one of so many is timed; the very first ones are unlike the others
 RATES_SECONDS = 0.5  # to measure the machine's rates in, once training has ended

@@ -28,7 +28,7 @@ from stages.train.curve import (
     write_curve,
 )
 from stages.train.data import field_background, guided_dataset
-from stages.train.fields import field_of, make_trainer
+from stages.train.fields.field_list import field_of, make_trainer
 from stages.train.loop import TrainingRun
 from stages.train.more import budget_of, earlier_seconds
 from stages.train.precision import precision_facts, say_if_inexact

@@ -24,23 +24,20 @@ from stages.io.field_files import load_field
 from stages.io.files import read_scene
 from stages.train import loop
 from stages.train.data import training_dataset
-from stages.train.fields import make_trainer, with_defaults
+from stages.train.fields.field_list import make_trainer, with_defaults
+from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.health_check import symptom_of
 from tests.refusals import refused
 from tests.stages.photo_scene import photographed
 
+GRID: dict[str, Any] = {"num_levels": 2, "log2_hashmap_size": 10, "max_res": 32, "target_samples": 1024}
 KINDS: dict[str, dict[str, Any]] = {
-    "torch": {"backend": "torch"},
-    "warp": {"backend": "warp"},
-    "paper": {"depth": 2, "width": 16, "samples_coarse": 8, "samples_fine": 8, "batch_rays": 64},
-}
-GRID: dict[str, Any] = {
-    "field": "grid",
-    "levels": 2,
-    "log2_rows": 10,
-    "finest": 32,
-    "batch_samples": 1024,
-    "learning_rate": 2e-2,
+    "torch": {"grid": GRID | {"backend": "torch"}, "learning_rate": 2e-2},
+    "warp": {"grid": GRID | {"backend": "warp"}, "learning_rate": 2e-2},
+    "vanilla": {
+        "vanilla": {"depth": 2, "width": 16, "samples_coarse": 8, "samples_fine": 8, "batch_rays": 64},
+        "learning_rate": 5e-3,
+    },
 }
 WARM_UP = 40
 NAMED = ("training diverged", "the field does not learn")
@@ -63,8 +60,7 @@ def inputs(tmp_path: Path) -> dict[str, Path]:
 
 def trained(kind: str, inputs: dict[str, Path], folder: Path, progress: Any, **settings: Any) -> StageResult:
     folder.mkdir(exist_ok=True)
-    base: dict[str, Any] = {"learning_rate": 5e-3} if kind == "paper" else GRID
-    config: dict[str, Any] = {"downscale": 1.0} | base | KINDS[kind] | settings
+    config: dict[str, Any] = {"downscale": 1.0} | KINDS[kind] | settings
     return train.run(train.Config(**config), inputs, folder, progress)
 
 
@@ -124,7 +120,7 @@ def test_weights_that_the_last_update_broke_are_never_kept(
 ) -> None:
     def break_one_weight(trainer: Any) -> None:
         weights = trainer.state()
-        weights["model.table" if kind != "paper" else "model.fine.trunk.0.weight"].view(-1)[7] = poison
+        weights["model.table" if kind != "vanilla" else "model.fine.trunk.0.weight"].view(-1)[7] = poison
 
     spoil_once_at(12, break_one_weight, monkeypatch, kind)
     result = trained(kind, inputs, tmp_path / "train", progress, steps=12)
@@ -192,18 +188,18 @@ def test_every_checkpoint_of_a_sound_run_is_sound(kind: str, inputs: dict[str, P
     assert not any("lost" in note or "no use" in note for note in progress.notes)
 
 
-@pytest.mark.parametrize("other", [{"log2_rows": 11}, {"finest": 31}, {"levels": 3}])
+@pytest.mark.parametrize("other", [{"log2_hashmap_size": 11}, {"max_res": 31}, {"num_levels": 3}])
 def test_a_checkpoint_of_another_field_is_named_and_skipped(
     other: dict[str, int], inputs: dict[str, Path], tmp_path: Path, progress: Any
 ) -> None:
-    _checkpoint_of_another(tmp_path, inputs, progress, "torch", other)
+    _checkpoint_of_another(tmp_path, inputs, progress, "torch", {"grid": KINDS["torch"]["grid"] | other})
 
 
 @pytest.mark.parametrize("other", [{"width": 18}, {"depth": 3}, {"density_activation": "relu"}, {"spacing": "log"}])
-def test_so_is_one_of_another_paper_field(
+def test_so_is_one_of_another_vanilla_field(
     other: dict[str, Any], inputs: dict[str, Path], tmp_path: Path, progress: Any
 ) -> None:
-    _checkpoint_of_another(tmp_path, inputs, progress, "paper", other)
+    _checkpoint_of_another(tmp_path, inputs, progress, "vanilla", {"vanilla": KINDS["vanilla"]["vanilla"] | other})
 
 
 def _checkpoint_of_another(
@@ -236,8 +232,7 @@ def test_no_number_is_a_symptom(inputs: dict[str, Path], progress: Any) -> None:
 
 
 def train_loop_trainer(inputs: dict[str, Path], dataset: RayDataset) -> HashGridTrainer:
-    settings: dict[str, Any] = {"downscale": 1.0, "steps": 1, "chunks": 1} | GRID | KINDS["torch"]
-    asked = train.Config(**settings)
+    asked = train.Config(downscale=1.0, steps=1, grid=HashGridOptions(**GRID, micro_batches=1, backend="torch"))
     config = with_defaults(asked.model_copy(update={"contracted": False, "view_dependence": True}))
     trainer = make_trainer(config, read_scene(inputs["normalise"]), dataset, 0)
     assert isinstance(trainer, HashGridTrainer)
@@ -277,7 +272,7 @@ def _forget(trainer: Any) -> None:
 
 def spoil_at(step: int, spoil: Callable[[Any], None], monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     """``spoil`` the trainer whenever it has taken so many steps."""
-    trainer = VanillaTrainer if kind == "paper" else HashGridTrainer
+    trainer = VanillaTrainer if kind == "vanilla" else HashGridTrainer
     take = trainer.step
 
     def spoiled(self: Any, number: int, *rest: float):

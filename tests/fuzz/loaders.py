@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from hypothesis import strategies as st
 
-from pipeline.cli.settings import UsageError
+from pipeline.cli.options import UsageError
 from pipeline.engine.manifests import BadManifest
 from stages.contract import StageError
 from stages.ingest.decoding import DecodeError

@@ -16,7 +16,7 @@ from safetensors.numpy import save
 
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from pipeline.cli.commands import _reader
-from pipeline.cli.settings import read_toml, settings_from
+from pipeline.cli.options import read_toml, settings_from
 from pipeline.engine import manifests, status
 from pipeline.engine.manifests import Manifest, outputs_digest, sealed
 from pipeline.engine.run_file import VERSION

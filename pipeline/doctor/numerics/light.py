@@ -173,7 +173,7 @@ CASES = [
         where="nerf/rendering/sampling.py: stratified",
         domain="0 < near ≤ far < 3e38 near",
         hazard="far/near overflows",
-        answer="not guarded: far/near is below 1e6 in any scene, and paper fields take rays in float64",
+        answer="not guarded: far/near is below 1e6 in any scene, and the vanilla NeRF takes rays in float64",
         tried="near < 1 < far < 1000; near = 1e-30 with far = 1, near = far",
         typical=lambda: (uniform(1, 0.05, 1, 256), uniform(2, 1, 1000, 256)),
         extreme=lambda: (torch.tensor([1e-30, 5.0, 1e-4]), torch.tensor([1.0, 5.0, 1e4])),

@@ -325,7 +325,7 @@ CASES = [
         kernels=True,
     ),
     Case(
-        formula="density log(1 + exp(x + shift)) of the paper's field",
+        formula="density log(1 + exp(x + shift)) of the vanilla NeRF",
         where="nerf/fields/vanilla.py: shifted_softplus",
         domain="all finite x",
         hazard="exp overflows beyond 88; 1 + exp(x) loses x < −16",

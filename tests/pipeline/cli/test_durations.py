@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.cli.durations import seconds_from
-from pipeline.cli.settings import UsageError
+from pipeline.cli.options import UsageError
 from stages.amounts import duration_option
 
 

@@ -9,7 +9,10 @@ from nerf.training.hash_grid_trainer import HashGridTrainer
 from pipeline.cli.commands import run_command
 from tests.small_scenes import write_blender_scene
 
-SMALL = "--train.levels 2 --train.log2-rows 8 --train.finest 16 --train.batch-samples 512 --train.chunks 1".split()
+SMALL = (
+    "--train.grid.num-levels 2 --train.grid.log2-hashmap-size 8 --train.grid.max-res 16"
+    " --train.grid.target-samples 512 --train.grid.micro-batches 1"
+).split()
 
 
 @pytest.fixture(scope="module")

@@ -19,6 +19,7 @@ from stages.contract import StageConfig, StageError, StageResult, reading_second
 from stages.hardware.device import processors
 from stages.io.files import write_durably, write_json
 from stages.io.photos import Photo, write_photos
+from stages.train.config import Config as TrainConfig
 
 CHAIN = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "report")
 INPUTS: dict[str, tuple[str, ...]] = {
@@ -60,17 +61,9 @@ class Training(Stage):
     preset: str | None = None
     after: str | None = None
 
-    @property
-    def time_is_open(self) -> bool:
-        return self.seconds is None and self.steps is None and self.after is None
-
-    @property
-    def exempt_from_budget(self) -> bool:
-        return self.after is not None
-
-    @property
-    def planned_seconds(self) -> float | None:
-        return None if self.steps is not None else self.seconds or 180.0
+    time_is_open = TrainConfig.time_is_open  # pyright: ignore[reportIncompatibleMethodOverride]
+    exempt_from_budget = TrainConfig.exempt_from_budget  # pyright: ignore[reportIncompatibleMethodOverride]
+    planned_seconds = TrainConfig.planned_seconds
 
 
 class Fixed(StageConfig):

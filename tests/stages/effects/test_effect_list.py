@@ -10,7 +10,7 @@ import torch
 
 from nerf.effects.appearance import AppearanceModel
 from nerf.effects.exposure import ExposureModel
-from pipeline.cli.settings import Settings, with_effects
+from pipeline.cli.options import Settings, with_effects
 from stages import effects, evaluate, render, train
 from stages.effects.effect_list import EFFECTS, Effect, EffectParts
 from stages.effects.image_effects import photo_effects
@@ -19,6 +19,7 @@ from stages.io.files import read_json, read_scene
 from stages.render.renderer import load_renderer
 from stages.render.video import as_asked
 from stages.report.effects import effects_table
+from stages.train.fields.hash_grid_options import HashGridOptions
 from tests.effect_scenes import Effects, effect_scene
 from tests.nerf.effects import veil
 from tests.nerf.effects.veil import VeilModel
@@ -43,8 +44,8 @@ def trained(listed: None, tmp_path: Path) -> dict[str, Path]:
         inputs[name].mkdir()
     decide = with_effects(Settings(), ["veil=on", "exposure=on"]).effects.model_copy(update={"pilots": 0})
     effects.run(decide, inputs, inputs["effects"], Quiet())
-    sizes: dict[str, Any] = {"levels": 2, "log2_rows": 8, "finest": 16, "batch_samples": 512}
-    train.run(train.Config(downscale=8.0, steps=5, **sizes), inputs, inputs["train"], Quiet())
+    grid = HashGridOptions(num_levels=2, log2_hashmap_size=8, max_res=16, target_samples=512)
+    train.run(train.Config(downscale=8.0, steps=5, grid=grid), inputs, inputs["train"], Quiet())
     return inputs
 
 

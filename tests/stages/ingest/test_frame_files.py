@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from stages.ingest.frame_files import FrameFiles
 from stages.ingest.sources import find_source, unused_masks
 from tests.stages.ingest.test_sources import names, refusal, touch, transforms
 
@@ -154,3 +155,12 @@ def test_each_folder_is_listed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(os, "listdir", lambda folder: listed.append(folder) or real(folder))
     assert len(names(find_source(transforms(tmp_path / "transforms.json", *written, "gone")))) == 10
     assert listed.count(tmp_path / "train") == 1 and listed.count(tmp_path) == 1
+
+
+def test_each_photo_is_looked_for_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = [f"train/{index}" for index in range(3)]
+    touch(tmp_path, *(f"{name}.png" for name in written))
+    sought, real = [], FrameFiles._photo
+    monkeypatch.setattr(FrameFiles, "_photo", lambda self, *names: sought.append(names) or real(self, *names))
+    assert len(names(find_source(transforms(tmp_path / "transforms.json", *written)))) == 3
+    assert sought == [(name,) for name in written]

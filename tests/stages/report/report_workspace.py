@@ -127,7 +127,7 @@ def _write_training(folder: Path) -> None:
     ]
     about = {"field": "grid", "device": "cpu", "threads": 2, "whole": True}
     write_json(folder / "curve.json", about | {"points": curve})
-    write_json(folder / "field.json", {"kind": "paper", "downscale": 1.0, "steps": 600, "rays": 600_000})
+    write_json(folder / "field.json", {"kind": "vanilla", "downscale": 1.0, "steps": 600, "rays": 600_000})
     write_json(folder / "profile.json", PARTS)
 
 

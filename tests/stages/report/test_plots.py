@@ -73,8 +73,9 @@ def test_the_curve_shows_prediction_and_knee():
     flat = [row | {"heldout_psnr": 20 - 8 / row["seconds"]} for row in _curve()]
     assert "knee, 16 s" in (curve_svg(flat, {}) or "")
     unknown = [row | {"heldout_psnr": None} for row in _curve()]
-    for about in (("grid", True, unknown), ("paper", True, _curve()), ("grid", False, _curve())):
-        assert coming_doubling(*about) is None
+    assert coming_doubling("grid", True, unknown) is None
+    assert coming_doubling("vanilla", True, _curve()) is None
+    assert coming_doubling("grid", False, _curve()) is None
     assert "predicted" not in (curve_svg(unknown, {}) or "predicted")
 
 

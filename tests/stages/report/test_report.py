@@ -57,7 +57,7 @@ def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path
         "reprojection_px": 0.61,
         "cameras_verdict": None,
         "cameras_doubtful": False,
-        "field": "paper",
+        "field": "vanilla",
         "train_seconds": 183.3,
         "total_seconds": pytest.approx(58.2 + 181.7 + 60.1 + 4 * 2.5),
         "stage_seconds": {"ingest": 2.5, "sfm": 58.2, "normalise": 2.5, "train": 181.7}
@@ -227,14 +227,14 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
     study |= {
         "workspace_field": None,
         "scored": "6 crops of 2 held-out photos",
-        "left_out": ["paper, published: 5 steps"],
+        "left_out": ["vanilla, published: 5 steps"],
     }
     write_json(inputs["tradeoff"] / "tradeoff.json", study)
     (inputs["tradeoff"] / "manifest.json").write_text('{"seconds": 1800}')
     assert "What quality costs here" not in before
     text, summary = written(inputs, tmp_path / "out", progress)
     assert "What quality costs here" in text and study["recommendation"] in text
-    for words in ("All 3 settings", "<b>23.00 ± 0.20</b>", ">18.00<", "6 crops of 2", "paper, published: 5 steps"):
+    for words in ("All 3 settings", "<b>23.00 ± 0.20</b>", ">18.00<", "6 crops of 2", "vanilla, published: 5 steps"):
         assert words in text, words
     assert "reduced, a part left out" in text, "the plot's legend"
     assert "Train it: <code>pipeline train fox.nerf --train.seconds 20</code>" in text

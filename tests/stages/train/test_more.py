@@ -10,6 +10,7 @@ from nerf.geometry.scene import Camera, Scene
 from stages import train
 from stages.io.files import read_json, write_json
 from stages.train import Config
+from stages.train.fields.vanilla_options import VanillaOptions
 from stages.train.more import training_name
 from stages.train.planning import larger_photos_words
 from tests.stages.photo_scene import photographed
@@ -18,7 +19,7 @@ DIGEST = "d" * 64
 NAME = training_name("k" * 64, DIGEST)
 
 
-FIELD: dict[str, Any] = {"field": "paper", "batch_rays": 3000}
+FIELD: dict[str, Any] = {"field": "vanilla", "vanilla": VanillaOptions(batch_rays=3000)}
 
 
 @pytest.fixture

@@ -21,16 +21,18 @@ from stages.hardware.backend import load_backend
 from stages.io.files import read_json
 from stages.report.profile import PARTS, parts_bar
 from stages.train import Config
-from stages.train.fields import field_of
+from stages.train.fields.field_list import field_of
 from stages.train.fields.hash_grid import field_settings
+from stages.train.fields.hash_grid_options import HashGridOptions
+from stages.train.fields.vanilla_options import VanillaOptions
 from stages.train.profile import FIRST_TIMED, RATES_SECONDS, TIMED_EVERY, observed, parts_table, write_parts
 from tests.small_scenes import pinhole_directions
 
 CPU = torch.device("cpu")
 RATES = Rates(1e10, 1e8, 1e10)
 GRID_PARTS = {"batch", "march", "gather", "encode", "mlp", "composite", "backward", "scatter", "optimiser", "cache"}
-PAPER_PARTS = {"batch", "sampling", "encode", "mlp", "composite", "backward", "optimiser"}
-PAPER: dict[str, Any] = {"depth": 3, "width": 16, "skip": 1, "samples_coarse": 8, "samples_fine": 8}
+VANILLA_PARTS = {"batch", "sampling", "encode", "mlp", "composite", "backward", "optimiser"}
+VANILLA: dict[str, Any] = {"depth": 3, "width": 16, "skip": 1, "samples_coarse": 8, "samples_fine": 8}
 COUNTED: dict[str, Any] = {"steps": 1, "rays": 8, "samples": 80, "densities": 200, "seconds": 1.0, "core_seconds": 1.0}
 
 
@@ -43,9 +45,9 @@ def dataset() -> RayDataset:
 
 
 def trainer(kind: str) -> HashGridTrainer | VanillaTrainer:
-    if kind == "paper":
+    if kind == "vanilla":
         return VanillaTrainer(
-            VanillaNerf(VanillaSettings(**PAPER), 0), dataset(), VanillaTrainerSettings(32, 0, "random")
+            VanillaNerf(VanillaSettings(**VANILLA), 0), dataset(), VanillaTrainerSettings(32, 0, "random")
         )
     backend = load_backend("warp" if kind == "warp" else "torch", "cpu")
     settings = HashGridTrainerSettings(0, "random", samples=512, chunks=2, distortion=1e-3)
@@ -58,7 +60,7 @@ def timed_step(of: HashGridTrainer | VanillaTrainer, step: int, timings: dict[st
     return observed(partial(of.step, step, 0.1, 1.0), step, timings, CPU)
 
 
-@pytest.mark.parametrize("kind", ["torch", "warp", "paper"])
+@pytest.mark.parametrize("kind", ["torch", "warp", "vanilla"])
 def test_timed_and_untimed_runs_have_equal_bits(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stages.train.profile.TIMED_EVERY", 1)
     monkeypatch.setattr("stages.train.profile.FIRST_TIMED", 0)
@@ -70,7 +72,7 @@ def test_timed_and_untimed_runs_have_equal_bits(kind: str, monkeypatch: pytest.M
         assert torch.equal(tensor, timed.state()[name]), name
 
 
-@pytest.mark.parametrize("kind", ["torch", "warp", "paper"])
+@pytest.mark.parametrize("kind", ["torch", "warp", "vanilla"])
 def test_shares_sum_to_one_and_every_part_is_there(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stages.train.profile.TIMED_EVERY", 1)
     monkeypatch.setattr("stages.train.profile.FIRST_TIMED", 0)
@@ -84,7 +86,7 @@ def test_shares_sum_to_one_and_every_part_is_there(kind: str, monkeypatch: pytes
     assert sum(row["share"] for row in table["parts"]) == pytest.approx(1, abs=1e-3)
     assert sum(row["seconds"] for row in table["parts"]) == pytest.approx(table["core_seconds"], abs=2e-3)
     names = {row["part"] for row in table["parts"]}
-    assert names == (PAPER_PARTS if kind == "paper" else GRID_PARTS) | {"rest", "waiting"}
+    assert names == (VANILLA_PARTS if kind == "vanilla" else GRID_PARTS) | {"rest", "waiting"}
     assert all(row["seconds"] >= 0 for row in table["parts"])
     seconds = [row["seconds"] for row in table["parts"]]
     assert seconds == sorted(seconds, reverse=True)
@@ -92,21 +94,21 @@ def test_shares_sum_to_one_and_every_part_is_there(kind: str, monkeypatch: pytes
 
 
 def test_few_steps_are_timed() -> None:
-    of, timings = trainer("paper"), {}
+    of, timings = trainer("vanilla"), {}
     for step in range(TIMED_EVERY + FIRST_TIMED + 1):
         timed_step(of, step, timings)
     assert timings["steps"] == 2
 
 
-@pytest.mark.parametrize("kind", ["torch", "paper"])
+@pytest.mark.parametrize("kind", ["torch", "vanilla"])
 @pytest.mark.parametrize("changed", [{}, {"hierarchical": False}, {"skip": 4}, {"view_dependence": False}])
 def test_products_are_those_that_torch_counts(
     kind: str, changed: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if kind == "torch" and changed:
-        pytest.skip("settings of the paper field")
+        pytest.skip("settings of the vanilla field")
     for name, value in changed.items():
-        monkeypatch.setitem(PAPER, name, value)
+        monkeypatch.setitem(VANILLA, name, value)
     of, timings = trainer(kind), {}
     monkeypatch.setattr("nerf.runtime.parallel.workers", lambda: 1)  # the counter sees the thread that it is opened in
     with FlopCounterMode(display=False) as counted:
@@ -172,7 +174,7 @@ def test_the_page_has_a_row_per_part() -> None:
 def test_the_file_is_written_where_a_step_was_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     monkeypatch.setattr("stages.train.profile.measure_rates", lambda *sizes: asked.append(sizes) or RATES)
-    of, timings, config = trainer("paper"), {}, Config(field="paper", width=16)
+    of, timings, config = trainer("vanilla"), {}, Config(vanilla=VanillaOptions(width=16))
     assert write_parts(tmp_path, timings, config, CPU) == []
     timed_step(of, FIRST_TIMED, timings)
     assert write_parts(tmp_path, timings, config, CPU) == ["profile.json"]
@@ -181,6 +183,7 @@ def test_the_file_is_written_where_a_step_was_timed(tmp_path: Path, monkeypatch:
 
 
 def test_hash_grid_rates_are_at_its_table_size() -> None:
-    config = Config(levels=2, log2_rows=8, finest=64, contracted=False, view_dependence=True)
+    grid = HashGridOptions(num_levels=2, log2_hashmap_size=8, max_res=64)
+    config = Config(grid=grid, contracted=False, view_dependence=True)
     rows = field_of(config).table_rows(config)
     assert (field_of(config).matmul_width(config), rows) == (64, field_settings(config, sky=False).layout.rows)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.cli.commands import run_command
-from pipeline.cli.display import PlainDisplay, choose_display, end_line
+from pipeline.cli.terminal import PlainDisplay, choose_display, end_line
 from pipeline.engine.display import Display
 from stages.contract import StageError
 
