@@ -4,8 +4,8 @@ python -m benchmarks.forward_facing fern.nerf --steps 1500 --out benchmarks/resu
 python -m benchmarks.forward_facing fern.nerf --device cuda --steps 4000 --maps ndc contraction --max-res 1024 2048
 
 A workspace needs its stages up to normalise, and ingest's images. Photos are trained and scored at their full size:
-PSNR over --pixels pixels of each test photo, drawn once. What is not given is as stage train has it. ``cpu_seconds`` is the time of all cores together, without
-scoring.
+PSNR over --pixels pixels of each test photo, drawn once. What is not given is as stage train has it. ``cpu_seconds``
+is the time of all cores together, without scoring.
 """
 
 import argparse
