@@ -24,8 +24,6 @@ from stages.io.files import read_json, read_scene
 from stages.render.path import CameraPath, path_rays
 from stages.render.renderer import load_renderer
 
-EVERY_PHOTO = 10**6
-
 
 class Case(NamedTuple):
     """A set, photo width / trained width, seconds of training, and the width of the timed frame."""
@@ -64,7 +62,7 @@ def train(workspace: Path, case: Case) -> float:
     _, status, usage = os.wait4(process.pid, 0)
     if status:
         raise SystemExit(f"{' '.join(command)} ended with status {status}")
-    pipeline("evaluate", workspace, "--evaluate.photos", str(EVERY_PHOTO))
+    pipeline("evaluate", workspace, "--evaluate.fraction", "1")
     return usage.ru_maxrss / 1e6
 
 
@@ -77,7 +75,7 @@ def frame_seconds(workspace: Path, width: int) -> tuple[float, str]:
     seconds = []
     for _ in range(2):
         started = time.perf_counter()
-        renderer.draw(rays)
+        renderer.render(rays)
         seconds.append(time.perf_counter() - started)
     return min(seconds), "×".join(map(str, reversed(rays.near.shape)))
 
@@ -93,7 +91,7 @@ def figures(workspace: Path, case: Case, memory_gb: float) -> dict[str, Any]:
         "downscale": case.downscale,
         "seconds": case.seconds,
         "grids": f"{field['num_levels']} × 2^{field['log2_hashmap_size']} to {field['max_res']}",
-        **{name: facts[name] for name in ("steps", "rays_per_second", "samples_per_second")},
+        **{name: facts[name] for name in ("steps", "rays_per_second", "colours_per_second")},
         "psnr": metrics["psnr"],
         "ssim": metrics["ssim"],
         "frame_seconds": frame,

@@ -47,7 +47,7 @@ def first(take, *_):
     print("first step done at", time.time(), flush=True)
     os._exit(0)
 
-training_loop.observed = first
+training_loop.profiled_step = first
 main()
 """
 

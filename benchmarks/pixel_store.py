@@ -98,7 +98,9 @@ def draw(dataset: RayDataset, where: str, record: Record, repeats: int = REPEATS
     order = PixelSampler(dataset.unmasked_count, 0, dataset.device)
     for count in BATCHES:
         places = itertools.count(step=count)
-        taken = milliseconds(lambda n=count, p=places: dataset.lookup(dataset.nth(order.take(next(p), n))), repeats)
+        taken = milliseconds(
+            lambda n=count, p=places: dataset.lookup(dataset.unmasked_pixels(order.take(next(p), n))), repeats
+        )
         record.add(what=f"{count} rays, {where}", **taken, **memory())
 
 

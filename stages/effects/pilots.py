@@ -31,7 +31,7 @@ from stages.train.fields.field_list import make_trainer, with_defaults
 from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.fields.space import chosen_space
 from stages.train.planning import seconds_per_step
-from stages.train.validation_images import set_aside
+from stages.train.validation_images import split_off_validation
 
 LONG_SIDE = 200  # pixels of the photos in a pilot
 MAX_KEPT = 4  # of the training photos, to judge by; with fewer than MIN_FOR_INTERVAL their own noise is not known
@@ -90,7 +90,7 @@ class _Trained(NamedTuple):
 
 def pilot_scene(inputs: Inputs, scene: Scene, progress: Progress) -> PilotScene | str:
     """Small photos to train on and to judge by, both from the training photos; or why there can be no pilot."""
-    split = set_aside(scene, MAX_KEPT, MIN_FOR_INTERVAL)
+    split = split_off_validation(scene, MAX_KEPT, MIN_FOR_INTERVAL)
     if split is None:
         return "too few training photos"
     cameras = [scene.cameras[view.camera] for view in scene.views]

@@ -78,7 +78,7 @@ def why_not_warp(device: str) -> str | None:
         if isinstance(error, OSError) and error.filename is not None:  # a library that does not load names none
             return _not_kept(error)
         return f"warp-lang does not load here: {error}"
-    return kernels.why_not(device)
+    return kernels.unavailable_reason(device)
 
 
 def _not_kept(error: OSError) -> str:

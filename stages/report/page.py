@@ -16,6 +16,7 @@ from PIL import Image
 from nerf.geometry.scene import Scene
 from stages.amounts import duration, short_count
 from stages.contract import Inputs
+from stages.evaluate.summary import scored_on
 from stages.io.ascii_names import shell_quoted
 from stages.io.files import read_json, read_scene, read_tensors
 from stages.io.pixels import load_pixels, pillow
@@ -30,10 +31,10 @@ from stages.report.cameras import (
     uncertainty,
 )
 from stages.report.effects import effects_table
-from stages.report.plots import ORDER_COLOURS, camera_svgs, curve_svg
-from stages.report.profile import parts_bar
+from stages.report.plots import ORDER_COLOURS, Score, camera_svgs, curve_svg
+from stages.report.profile import profile_bar
 from stages.tradeoff.plots import COLUMNS, plot_svg, rendering_sentence, table_cells
-from stages.train.curve import coming_doubling, doubling_words, knee_words, more_option, ssim_words
+from stages.train.curve import diminishing_returns_message, doubling_message, more_option, predicted_gain, ssim_message
 
 if TYPE_CHECKING:
     from stages.report import Config
@@ -58,7 +59,7 @@ class Results:
     effects: dict[str, Any] | None
     field: dict[str, Any] | None
     curve: dict[str, Any] | None
-    parts: dict[str, Any] | None
+    profile: dict[str, Any] | None
     metrics: dict[str, Any] | None
     study: dict[str, Any] | None
 
@@ -79,7 +80,7 @@ def read_results(inputs: Inputs, stages: Sequence[str]) -> Results:
         effects=of("effects", "effects.json"),
         field=of("train", "field.json"),
         curve=of("train", "curve.json"),
-        parts=of("train", "profile.json")
+        profile=of("train", "profile.json")
         if "train" in inputs and (inputs["train"] / "profile.json").exists()
         else None,
         metrics=of("evaluate", "metrics.json"),
@@ -103,8 +104,9 @@ def summarise(results: Results) -> dict[str, Any]:
         "total_seconds": round(train.get("earlier_seconds", 0.0) + sum(m["seconds"] for m in manifests.values()), 3),
         "stage_seconds": {stage: manifest["seconds"] for stage, manifest in manifests.items()},
         "expected_seconds": _expected(manifests),
-        "training_parts": results.parts,
+        "training_profile": results.profile,
         **{key: metrics.get(key) for key in ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")},
+        "scored_fraction": metrics.get("fraction"),
         "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
         "verdict": metrics.get("verdict", "Not measured: stage evaluate has not run."),
     }
@@ -144,8 +146,9 @@ def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
         **_cameras_part(results, names),
         effects=effects_table(results.effects),
         curve=_curve(results),
-        parts=parts_bar(results.parts),
+        profile=profile_bar(results.profile),
         metrics=results.metrics,
+        scored_on=scored_on(results.metrics) if results.metrics and results.metrics["images"] else None,
         compared=_compared(results),
         video=_video(results.inputs, config.video_limit_mb),
         **_mesh_part(results),
@@ -265,11 +268,13 @@ def _curve(results: Results) -> dict[str, Any] | None:
         return None
     points, metrics = results.curve["points"], results.metrics or {}
     baselines = {"nearest training view": "psnr_nearest_view", "mean image": "psnr_mean_image"}
-    coming = coming_doubling(results.curve["field"], results.curve["whole"], points)
-    svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming)
+    coming = predicted_gain(results.curve["field"], results.curve["single_cycle"], points)
+    scored = metrics.get("psnr") is not None
+    score = Score(metrics["psnr"], metrics["psnr_interval"]) if scored else None
+    svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming, score)
     if svg is None:
         return None
-    words = [doubling_words(points, coming), knee_words(points), ssim_words(points)]
+    words = [doubling_message(points, coming), diminishing_returns_message(points), ssim_message(points)]
     threads = results.curve["threads"]
     where = "a GPU" if results.curve["device"] == "cuda" else f"{threads} processor core{'' if threads == 1 else 's'}"
     sentences = [f"{word[0].upper()}{word[1:]}." for word in words if word]

@@ -54,7 +54,7 @@ def test_every_field_and_backend(chain: Chain, tmp_path: Path, kind: str):
         workspace = chain.before("effects", tmp_path / f"{count}.nerf")
         sizes = "" if kind == "vanilla" else TINY_GRID
         words = f"run {chain.photos} -o {workspace} --until evaluate {sizes} {FIELDS[kind]}"
-        words += " --train.downscale 1 --evaluate.photos 2"
+        words += " --train.downscale 1 --evaluate.fraction 1"
         Program(words.split(), tmp_path / "says", Threads(count)).finish()
         found.append(results(workspace))
     assert found[0] == found[1] == found[2] and {"train", "evaluate"} <= found[0].keys()

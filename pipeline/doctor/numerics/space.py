@@ -330,7 +330,7 @@ CASES = [
         **_unit_points(False),
     ),
     Case(
-        formula="unit coordinates of samples, all of space",
+        formula="unit coordinates of samples, contracted",
         where="nerf/kernels/torch/marching.py: sample_points, sample_points_backward",
         domain="all finite points",
         hazard="r³ overflows beyond 1e12 in the gradient −2 (r − 1)/r³",

@@ -249,10 +249,10 @@ def _trainer_settings(config: Config, scene: "Scene", seed: int) -> HashGridTrai
     return HashGridTrainerSettings(
         seed=seed,
         background=training_background(config, scene),
-        samples=grid.target_samples,
-        chunks=grid.micro_batches,
-        rate=config.learning_rate,
-        distortion=DISTORTION[_space(config)],
-        depth_loss=DEPTH_LOSS,
-        least_photos=MIN_PHOTOS,
+        target_samples=grid.target_samples,
+        micro_batches=grid.micro_batches,
+        learning_rate=config.learning_rate,
+        distortion_weight=DISTORTION[_space(config)],
+        depth_weight=DEPTH_LOSS,
+        min_photos=MIN_PHOTOS,
     )

@@ -47,7 +47,10 @@ def test_more_chains_folders_of_its_own(trained, monkeypatch: pytest.MonkeyPatch
     assert (first / "manifest.json").read_bytes() == before, "the first stays as it was"
     linked = (Path(workspace) / "output" / "curve.json").resolve()
     assert linked == (second / "curve.json").resolve()
-    assert [json.loads((folder / "curve.json").read_text())["whole"] for folder in (first, second)] == [True, False]
+    assert [json.loads((folder / "curve.json").read_text())["single_cycle"] for folder in (first, second)] == [
+        True,
+        False,
+    ]
 
     moved = Path(workspace).rename(Path(workspace).with_name("moved.nerf"))
     try:

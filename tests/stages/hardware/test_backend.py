@@ -31,7 +31,7 @@ AS_TRAINED = "the hash-grid field is computed by torch alone, as it was trained:
 @pytest.fixture
 def useless(monkeypatch: pytest.MonkeyPatch) -> None:
     """Warp loads, but its kernels do not run."""
-    monkeypatch.setattr(warp, "why_not", lambda device: OLD_DRIVER)
+    monkeypatch.setattr(warp, "unavailable_reason", lambda device: OLD_DRIVER)
 
 
 @pytest.fixture
@@ -75,11 +75,11 @@ def test_where_kernels_cannot_be_kept_the_way_out_is_named(tmp_path: Path, monke
 
 def test_why_not_says_what_is_wrong_with_a_gpu_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("warp.is_cuda_available", lambda: False)
-    assert warp.why_not("cpu") is None
-    why = warp.why_not("cuda")
+    assert warp.unavailable_reason("cpu") is None
+    why = warp.unavailable_reason("cuda")
     assert why and why.startswith("Warp 1.") and why.endswith(" finds no CUDA driver that is new enough for it")
     monkeypatch.setattr("warp.is_cuda_available", lambda: True)
-    assert warp.why_not("cuda") is None
+    assert warp.unavailable_reason("cuda") is None
 
 
 def test_a_backend_is_loaded_by_name(progress) -> None:
@@ -118,7 +118,7 @@ def test_planning_chooses_and_keeps_a_backend(tmp_path: Path, progress, monkeypa
     inputs, _ = photographed(tmp_path)
     sized = tiny(steps=10)
     assert train.plan(sized, inputs, progress).grid.backend == "warp"
-    monkeypatch.setattr(warp, "why_not", lambda device: OLD_DRIVER)
+    monkeypatch.setattr(warp, "unavailable_reason", lambda device: OLD_DRIVER)
     assert train.plan(sized, inputs, progress).grid.backend == "torch"
     assert progress.notes == [NOTE + OLD_DRIVER]
     with refused("hardware.no-warp", "--train.grid.backend torch"):
@@ -129,21 +129,21 @@ def test_both_backends_train_the_same_field_from_photos(tmp_path: Path, progress
     """Rounding parts them step by step, but little: over seeds 0 ... 3 they ended at most 0.04 dB apart, and the seeds
     themselves 0.3 dB."""
     inputs, _ = photographed(tmp_path, channels=4)
-    heldout = {}
+    found = {}
     backends: tuple[Literal["torch", "warp"], ...] = ("warp", "torch")
     for backend in backends:
         folder = tmp_path / backend
         folder.mkdir()
         result = train.run(tiny(backend, steps=120), inputs, folder, progress)
-        heldout[backend] = result.facts["heldout_psnr"]
+        found[backend] = result.facts["probe_psnr"]
         assert load_field(folder)[1]["kind"] == "grid"
     flat = 11.0  # dB, of the best single colour
-    assert flat + 2 < heldout["torch"] < 60
-    assert heldout["warp"] == pytest.approx(heldout["torch"], abs=0.1)
+    assert flat + 2 < found["torch"] < 60
+    assert found["warp"] == pytest.approx(found["torch"], abs=0.1)
 
 
 LATER: dict[ModuleType, StageConfig] = {
-    evaluate: evaluate.Config(photos=1),
+    evaluate: evaluate.Config(fraction=1),
     render: render.Config(frames=2, width=16),
     mesh: mesh.Config(resolution=16),
 }

@@ -65,7 +65,7 @@ def test_a_damaged_checkpoint_is_named_and_skipped(tmp_path: Path, harm: str) ->
     found = latest_checkpoint(tmp_path, said.append)
     assert found is not None and found.step == 3
     assert len(said) == 1 and said[0].startswith("the checkpoint of step 4 is damaged (")
-    assert said[0].endswith("); going back to the one before")
+    assert said[0].endswith("); using the one before")
     assert latest_checkpoint(tmp_path, pytest.fail) is not None
 
 
@@ -86,11 +86,11 @@ def test_not_finite_facts_are_refused(tmp_path: Path) -> None:
 
 
 def test_writing_replaces_the_whole_file(tmp_path: Path) -> None:
-    path = tmp_path / "plan.json"
+    path = tmp_path / "schedule.json"
     write_durably(path, json.dumps(list(range(100))).encode())
     write_durably(path, b"[]")
     assert path.read_bytes() == b"[]"
-    assert [p.name for p in tmp_path.iterdir()] == ["plan.json"]
+    assert [p.name for p in tmp_path.iterdir()] == ["schedule.json"]
 
 
 def test_no_flipped_bit_of_either_file_passes(tmp_path: Path) -> None:
@@ -126,4 +126,4 @@ def test_a_checkpoint_of_something_else_is_named_and_skipped(tmp_path: Path, fau
 
     found = latest_checkpoint(tmp_path, said.append, fits)
     assert found is not None and found.step == 3
-    assert said == [f"the checkpoint of step 4 is not of this training ({fault}); going back to the one before"]
+    assert said == [f"the checkpoint of step 4 belongs to another training ({fault}); using the one before"]

@@ -56,10 +56,10 @@ def words(inputs: dict[str, Path], **more: Any) -> str | None:
 
 def test_photos_larger_by_a_fifth_are_named(inputs: dict[str, Path]) -> None:
     stay = "photos stay at 1/2 of their size and the field as large as it is"
-    anew = "4 min from the start would have them at 1/1: --train.seconds 240, or a larger --budget, trains anew"
-    assert words(inputs, more_seconds=180.0) == f"{stay}; {anew}"
-    anew = "2,000 steps from the start would have them at 1/1.4: --train.steps 2000 trains anew"
-    assert words(inputs, more_steps=1000) == f"{stay}; {anew}"
+    advice = "4 min from the start would have them at 1/1: --train.seconds 240, or a larger --budget, trains anew"
+    assert words(inputs, more_seconds=180.0) == f"{stay}; {advice}"
+    advice = "2,000 steps from the start would have them at 1/1.4: --train.steps 2000 trains anew"
+    assert words(inputs, more_steps=1000) == f"{stay}; {advice}"
 
 
 def test_a_little_more_is_worth_no_word(inputs: dict[str, Path]) -> None:

@@ -18,11 +18,12 @@ from stages.io.files import read_json
 from stages.io.photos import Photo, write_photos
 from stages.train import Config
 from stages.train.config import FIELD_NAMES, OPTIONS_OF_FIELD, FieldName
+from stages.train.data import training_dataset
 from stages.train.fields.hash_grid import LEARNING_RATES
 from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.fields.vanilla_options import VanillaOptions
 from stages.train.training import prepare
-from stages.train.validation_images import unseen_photos, with_validation
+from stages.train.validation_images import held_out_evaluation, with_validation_split
 from tests.refusals import refused
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 
@@ -63,17 +64,17 @@ def test_photos_become_a_field_that_beats_a_flat_colour(tmp_path: Path, progress
     assert result.outputs == OUTPUTS
     assert all((tmp_path / "train" / name).exists() for name in (*result.outputs, *result.records))
     flat = 11.0  # dB, of the best single colour
-    assert flat + 2 < result.facts["heldout_psnr"] < 60
+    assert flat + 2 < result.facts["probe_psnr"] < 60
     _, info = load_field(tmp_path / "train")
     assert (info["steps"], info["rays"], info["downscale"], info["background"]) == (120, 120 * 64, 1.0, [1, 1, 1])
     assert result.facts["steps"] == 120 and result.facts["restarts"] == result.facts["rollbacks"] == 0
-    assert f"held out {result.facts['heldout_psnr']:.1f} dB, over time ▁" in result.line
+    assert f"{result.facts['probe_psnr']:.1f} dB on test pixels, over time ▁" in result.line
     curve = read_json(tmp_path / "train" / "curve.json")
     assert (curve["device"], curve["threads"], curve["downscale"]) == ("cpu", cores(), 1.0)
     last = curve["points"][-1]
     assert [point["step"] for point in curve["points"]] == [64, 91, 120]
-    assert set(last) == {"step", "seconds", "train_psnr", "heldout_psnr", "heldout_ssim"}
-    assert curve["points"][0]["heldout_ssim"] < last["heldout_ssim"] < 1
+    assert set(last) == {"step", "seconds", "train_psnr", "probe_psnr", "probe_ssim"}
+    assert curve["points"][0]["probe_ssim"] < last["probe_ssim"] < 1
     assert progress.notes[0] == "vanilla field (2 × 16), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels"
 
 
@@ -81,12 +82,12 @@ def test_the_grid_field_trains_from_photos_too(tmp_path: Path, progress) -> None
     inputs, _ = photographed(tmp_path, channels=4)
     result = trained(tmp_path / "train", inputs, progress, field="grid", steps=120, grid={"micro_batches": 2})
     flat = 11.0  # dB, of the best single colour
-    assert flat + 2 < result.facts["heldout_psnr"] < 60
+    assert flat + 2 < result.facts["probe_psnr"] < 60
     _, info = load_field(tmp_path / "train")
     assert (info["kind"], info["background"], result.facts["field"]) == ("grid", [1, 1, 1], "grid")
     assert (info["settings"]["num_levels"], info["settings"]["max_res"]) == (2, 32)
     assert 120 * 8 < info["rays"] < 120 * 8192
-    colours = result.facts["samples_per_second"] / result.facts["rays_per_second"]
+    colours = result.facts["colours_per_second"] / result.facts["rays_per_second"]
     assert 0.5 < colours < 100, "of a ray"
     assert progress.notes[:2] == [
         "grid field (2 grids of up to 2^10 rows, to 32³), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels",
@@ -124,7 +125,7 @@ def test_forty_steps_are_twenty_a_kill_and_twenty_more(
             trained(tmp_path / "cut", inputs, progress, **settings)
     assert not (tmp_path / "cut" / "field.json").exists()
     trained(tmp_path / "cut", inputs, progress, **settings)
-    assert "going on from step 20 of 40" in progress.notes
+    assert "resuming from step 20 of 40" in progress.notes
     for name in OUTPUTS:
         assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     final = "checkpoints/000000040.safetensors"  # the optimiser, too
@@ -146,12 +147,12 @@ def test_a_grid_field_that_diverges_is_rolled_back(tmp_path: Path, progress, mon
     assert result.facts["rollbacks"] == 1
     assert "nonfinite_30.safetensors" in result.records
     assert any("the loss of step 30 is not finite: back to step" in note for note in progress.notes)
-    assert 13 < result.facts["heldout_psnr"] < 60
+    assert 13 < result.facts["probe_psnr"] < 60
 
 
 def test_an_empty_hash_grid_field_is_given_up(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs, _ = photographed(tmp_path, channels=4)
-    monkeypatch.setattr("stages.train.loop.WARM_UP_STEPS", 3)
+    monkeypatch.setattr("stages.train.loop.MIN_HEALTHY_STEPS", 3)
     monkeypatch.setattr("nerf.fields.mlp.sigma_of", lambda geometry: 0 * geometry[:, 0])
     with refused("train.collapsed", "after 3 steps", "empty", "3 different seeds"):
         trained(tmp_path / "train", inputs, progress, field="grid", steps=20)
@@ -178,21 +179,29 @@ def test_without_test_photos_nothing_is_held_out(tmp_path: Path, progress) -> No
     scene_file = inputs["normalise"] / "scene.json"
     scene_file.write_text(scene_file.read_text().replace('"test"', '"train"'))
     result = trained(tmp_path / "train", inputs, progress, steps=2)
-    assert result.facts["heldout_psnr"] is None
-    assert "no photos held out" in result.line
+    assert result.facts["probe_psnr"] is None
+    assert "no test photos" in result.line
+
+
+def test_probes_are_at_the_size_that_photos_are_scored_at(tmp_path: Path, progress) -> None:
+    inputs, scene = photographed(tmp_path)
+    dataset = training_dataset(inputs["ingest"], scene, "test", 2.0, progress)
+    held_out = held_out_evaluation(Config(downscale=2.0), inputs["ingest"], scene, "test", "cpu", progress)
+    assert held_out
+    ball_and_white = {(30, 60, 200), (255, 255, 255)}
+    assert {*map(tuple, (held_out.pixels.colours * 255).round().int().tolist())} == ball_and_white
+    assert not {*map(tuple, dataset.pixels[:, :3].tolist())} <= ball_and_white, "at the trained size edges are mixed"
 
 
 def test_test_photos_of_which_masks_leave_nothing_stop_no_training(tmp_path: Path, progress) -> None:
     """Validation photos, by which a run is to end, do."""
-    dot = np.zeros((HEIGHT, WIDTH), np.uint8)
-    dot[4, 4] = 255
-    inputs, masked = photographed(tmp_path, mask=dot)
+    inputs, masked = photographed(tmp_path, mask=np.zeros((HEIGHT, WIDTH), np.uint8))
     config = Config(downscale=2.0)
-    assert unseen_photos(config, inputs["ingest"], masked, "test", "cpu", progress) is None
+    assert held_out_evaluation(config, inputs["ingest"], masked, "test", "cpu", progress) is None
     why = "the masks ignore every pixel of the test photos at this size"
-    assert progress.notes == [f"held-out quality is not measured while training: {why}"]
+    assert progress.notes == [f"test photos are not measured while training: {why}"]
     with refused("train.all-masked"):
-        unseen_photos(config, inputs["ingest"], with_validation(masked), "validation", "cpu", progress)
+        held_out_evaluation(config, inputs["ingest"], with_validation_split(masked), "validation", "cpu", progress)
 
 
 def test_two_budgets_are_refused_in_words() -> None:
@@ -324,16 +333,16 @@ def test_the_published_preset_is_the_published_model(tmp_path: Path, progress: P
 
 def test_every_seed_is_measured_on_the_same_pixels(tmp_path: Path, progress) -> None:
     inputs, scene = photographed(tmp_path, views=12)
-    scene = with_validation(scene)
+    scene = with_validation_split(scene)
     found = []
     for seed in (0, 5):
         (folder := tmp_path / f"train{seed}").mkdir()
         config = train.plan(tiny(steps=1, seed=seed, target_psnr=20.0), inputs, progress)
-        probes = prepare(config, scene, inputs, folder, progress).probes
-        assert probes.heldout and probes.target
-        unseen = (probes.heldout, probes.target.photos)
-        others = (probe for each in unseen for probe in (each.probe, each.patches.probe))
-        found.append([probe.colours for probe in (probes.train, *others)])
+        evaluation_sets = prepare(config, scene, inputs, folder, progress).evaluation_sets
+        assert evaluation_sets.test and evaluation_sets.target
+        held_out = (evaluation_sets.test, evaluation_sets.target.held_out)
+        others = (pixels for each in held_out for pixels in (each.pixels, each.patches.pixels))
+        found.append([pixels.colours for pixels in (evaluation_sets.train, *others)])
     assert len(found[0]) == 5 and all(torch.equal(*pair) for pair in zip(*found, strict=True))
 
 
@@ -341,16 +350,16 @@ def test_a_run_in_seconds_keeps_to_them(tmp_path: Path, progress) -> None:
     inputs, _ = photographed(tmp_path)
     result = trained(tmp_path / "train", inputs, progress, seconds=1.0)
     assert 0.7 < result.facts["train_seconds"] < 1.5
-    decisions = json.loads((tmp_path / "train" / "plan.json").read_text())
+    decisions = json.loads((tmp_path / "train" / "schedule.json").read_text())
     assert decisions[-1][1] == result.facts["steps"] > 2
 
 
-def test_a_target_is_judged_on_photos_set_aside(tmp_path: Path, progress) -> None:
+def test_a_target_is_judged_on_validation_photos(tmp_path: Path, progress) -> None:
     inputs, _ = photographed(tmp_path, views=12, channels=4)
     result = trained(tmp_path / "train", inputs, progress, field="grid", steps=400, target_psnr=14.0)
-    assert "1 of 9 training photos are set aside to tell when 14 dB are reached" in progress.notes
+    assert "1 of 9 training photos become validation photos, to tell when 14 dB are reached" in progress.notes
     assert result.facts["steps"] < 400 and result.facts["validation_psnr"] >= 14
-    assert "14 dB reached after" in result.line
+    assert "14 dB reached on validation photos after" in result.line
     assert "validation" not in (inputs["normalise"] / "scene.json").read_text()
 
 
