@@ -40,6 +40,11 @@ EFFECTS: dict[str, str] = {
     r"\b(PhotoRays|PhotoColours|AsGiven|AsRendered|photo_parts)\b": "ImageEffects",
     r"\b(Exposures|RefinedPoses)\b": "ExposureModel, PoseRefinement",
     r"neutral exposure": "reference exposure",
+    r"\b(HARM|SURE)\b": "MIN_EFFECT, MIN_SIGNAL_TO_NOISE",
+    r"\b_?judged\(": "classify",
+    r"(?i)two.?way\b": "additive view/point model",
+    r"\b(Odd|odd_photos)\b": "outlier images",
+    r"\b(lens|media|scale)_evidence": "camera_model_evidence, participating_media_evidence, scale_variation_evidence",
 }
 
 SFM_AND_INGEST: dict[str, str] = {
@@ -55,6 +60,9 @@ SFM_AND_INGEST: dict[str, str] = {
 }
 
 TRAINING: dict[str, str] = {
+    r"\bpaper('s)? fields?\b|--train\.field paper|_ONLY\b": "vanilla NeRF, --train.field vanilla",
+    r"\b(log2_rows|batch_samples)\b": "log2_hashmap_size, target_samples",
+    r"--train\.(log2-rows|finest|levels|chunks|batch-samples|ray-samples)\b": "--train.grid.*",
     r"\b(load_)?[Pp]ainter\b": "Renderer",
     r"\bpsnr_(right|fitted_right|posed_right)\b": "psnr_right_half, psnr_exposure_fitted, psnr_pose_fitted",
     r"\bparts\.json\b|\b(floor_share|most_rays_per_second|steps_timed)\b": "profile.json, efficiency, profiled steps",
