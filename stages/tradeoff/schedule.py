@@ -35,7 +35,7 @@ SMALL_SIDE = 128  # pixels: of photos for the vanilla NeRF, which learn nothing 
 WALL_TIME_RATIO = 1.2  # wall time of a run over its training seconds: validation, files, photos read before
 VALIDATION_RAYS = 6144  # rendered at the end of a training, which takes long only where a field renders slowly
 MAX_SCORING = 0.03  # of the study's time, for one score: where it would take more, only every SCORING_STRIDE-th pixel
-SCORING_STRIDE = 4  # is rendered, along both axes of the crops
+SCORING_STRIDE = 4  # is rendered, along both axes of the tiles
 MAX_RUN = 1 / 6  # of the study's time, for one run
 RENDERING_SPEED: dict[FieldName, float] = {"grid": 0.7, "vanilla": 3.0}
 """Rays rendered a second over rays trained, about: rendering does less, but a grid field of few steps is all fog."""
@@ -133,10 +133,10 @@ class Speed(NamedTuple):
 
 
 class ReadingTime(NamedTuple):
-    """Seconds to read photos: all of them before the first run at a size, and those of the evaluation crops."""
+    """Seconds to read photos: all of them before the first run at a size, and the test photos to score."""
 
     photos: float = 0.0
-    crops: float = 0.0
+    scored: float = 0.0
 
 
 NO_READING = ReadingTime()
@@ -144,7 +144,7 @@ NO_READING = ReadingTime()
 
 class Run(NamedTuple):
     """One training of a study, in a scene of that ``space``. ``seconds`` is what it is expected to take in all; every
-    ``stride``-th pixel of the evaluation crops is scored, along both axes."""
+    ``stride``-th pixel of the tiles is scored, along both axes."""
 
     variant: str
     space: Space
@@ -272,7 +272,7 @@ def make_schedule(
     ``scored_rays`` are rendered to score each, and the first run at a photo size has to read the photos. The published
     networks take fewer rays a step only where there is no time for as many as published.
     """
-    left, runs, left_out = seconds * (1 - OTHER_TIME) - reading.crops, dict[str, Run](), dict[str, Run]()
+    left, runs, left_out = seconds * (1 - OTHER_TIME) - reading.scored, dict[str, Run](), dict[str, Run]()
     for variant, size, level, seed in run_order(seeds):
         downscale = downscales[-1 if size == SMALL else min(size, max(0, len(downscales) - 2))]
         run = _run(variant, space, downscale, level, seed, seconds, speeds, scored_rays)
@@ -313,7 +313,7 @@ def rendered_rays_per_second(variant: str, speed: Speed) -> float:
 
 
 def scoring_stride(rendering: float, seconds: float) -> int:
-    """1 to score all pixels of the crops; SCORING_STRIDE where ``rendering`` them takes too many of a study's
+    """1 to score all pixels of the tiles; SCORING_STRIDE where ``rendering`` them takes too many of a study's
     ``seconds``."""
     return 1 if rendering <= MAX_SCORING * seconds else SCORING_STRIDE
 
@@ -387,8 +387,8 @@ def _multiplications(config: train.Config) -> float:
     return (2 * sizes.samples_coarse + sizes.samples_fine) * sizes.depth * sizes.width**2
 
 
-def measure_reading(scene: Scene, ingest: Path, crops: int) -> ReadingTime:
-    """What reading the photos takes, from the time of one of them: all on all cores, those of the crops one by one."""
+def measure_reading(scene: Scene, ingest: Path) -> ReadingTime:
+    """What reading the photos takes, from the time of one of them: all on all cores, the test photos one by one."""
 
     def pixels(views: Sequence[View]) -> int:
         return sum(scene.cameras[view.camera].width * scene.cameras[view.camera].height for view in views)
@@ -398,8 +398,7 @@ def measure_reading(scene: Scene, ingest: Path, crops: int) -> ReadingTime:
         started = time.perf_counter()
         load_pixels(ingest / view.file, *scaled_size(scene.cameras[view.camera], 2.0))
     per_pixel = (time.perf_counter() - started) / pixels(test[:1])
-    scored = [test[number % len(test)] for number in range(crops)]
-    return ReadingTime(per_pixel * pixels(scene.views) / processors(), per_pixel * pixels(scored))
+    return ReadingTime(per_pixel * pixels(scene.views) / processors(), per_pixel * pixels(test))
 
 
 def study_sizes(scene: Scene, speeds: Mapping[str, Speed], seconds: float) -> tuple[float, ...]:
