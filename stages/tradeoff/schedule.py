@@ -24,6 +24,7 @@ from stages.train.config import FieldName
 from stages.train.data import scaled_size
 from stages.train.fields import hash_grid
 from stages.train.fields.field_list import field_of
+from stages.train.fields.space import chosen_space
 from stages.train.planning import chosen_downscale, rays_per_second
 
 LONGEST_RUN = 1 / 20
@@ -357,12 +358,13 @@ def measure_speeds(scene: Scene, inputs: Inputs, seconds: float, progress: Progr
     longer than the whole timing. Otherwise their speed follows from their arithmetic relative to the reduced networks.
     """
     decisions, speeds = read_decisions(inputs["effects"]), dict[str, Speed]()
+    space, _ = chosen_space(decisions, scene)
     for number, name in enumerate(TIMED):
         progress.update(f"timing the training of: {name}", number / len(TIMED))
-        config = _planned(name, decisions.space, inputs, progress)
+        config = _planned(name, space, inputs, progress)
         rays_per_step = field_of(config).rays_per_step(config)
         if VARIANTS[name].family == "published":
-            reduced = _planned(REDUCED, decisions.space, inputs, progress)
+            reduced = _planned(REDUCED, space, inputs, progress)
             rays = speeds[REDUCED].rays * _multiplications(reduced) / _multiplications(config)
             if LONGEST_RUN * seconds * rays < VARIANTS[name].min_steps * rays_per_step:
                 speeds[name] = Speed(rays / rays_per_step, rays)

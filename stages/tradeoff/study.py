@@ -47,6 +47,7 @@ from stages.tradeoff.schedule import (
     study_sizes,
     train_command,
 )
+from stages.train.fields.space import chosen_space
 
 if TYPE_CHECKING:
     from stages.tradeoff import Config
@@ -86,7 +87,7 @@ def plan_study(config: "Config", inputs: Inputs, progress: Progress) -> "Config"
     reading = measure_reading(scene, inputs["ingest"])
     chosen = {
         "speeds": {name: (round(speed.steps, 4), round(speed.rays, 2)) for name, speed in speeds.items()},
-        "space": read_decisions(inputs["effects"]).space,
+        "space": chosen_space(read_decisions(inputs["effects"]), scene)[0],
         "sizes": sizes,
         "tiles": max(min(affordable, MAX_TILES), MIN_TILES * len(scene.of_split("test"))),
         "reading": (round(reading.photos, 5), round(reading.scored, 5)),
