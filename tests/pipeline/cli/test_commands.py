@@ -264,7 +264,7 @@ def test_budgets_are_spent_by_runs_alone(tmp_path: Path, capsys: pytest.CaptureF
     assert " s of 5 min spent →" in run_on(tmp_path / "photos", capsys, "--until", "ingest", "--budget", "5m")[1]
     before = json.loads((tmp_path / "w.nerf/run.json").read_text())["budget"]
     assert run_command(["ingest", str(tmp_path / "w.nerf"), "--force"]) == 0
-    assert "spent" not in capsys.readouterr().out
+    assert " spent →" not in capsys.readouterr().out
     assert json.loads((tmp_path / "w.nerf/run.json").read_text())["budget"] == before
 
 
