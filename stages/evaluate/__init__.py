@@ -16,6 +16,7 @@ from stages.amounts import duration, short_count
 from stages.contract import (
     Flexible,
     Inputs,
+    Note,
     Progress,
     StageConfig,
     StageError,
@@ -131,8 +132,9 @@ def _affordable(config: Config, scene: "Scene", train: Path, may_shrink: bool, p
     chosen = affordable(pixels, budget)  # one at least: only one where that takes too long
     if len(chosen) < len(test):
         progress.note(
+            "evaluate.slow-field",
             f"{short_count(speed)} rays/s here: all {len(test)} test photos take about "
-            f"{duration(sum(pixels) / speed)}, {allowance.words()}; --evaluate.photos asks for more"
+            f"{duration(sum(pixels) / speed)}, {allowance.words()}; --evaluate.photos asks for more",
         )
     downscale, one = config.downscale, pixels[chosen[0]]
     smallest = max(cameras[chosen[0]].width, cameras[chosen[0]].height) / MIN_SIDE
@@ -140,8 +142,9 @@ def _affordable(config: Config, scene: "Scene", train: Path, may_shrink: bool, p
     if may_shrink and saved > 0 and smallest > downscale:
         downscale = min(math.ceil(100 * downscale * math.sqrt(one / budget)) / 100, smallest)
         progress.note(
+            "evaluate.reduced",
             f"a test photo takes about {duration(one / speed)}, {allowance.words()}: it is scored at "
-            f"{1 / downscale:.0%} of its width; --evaluate.downscale {config.downscale:g} asks for more"
+            f"{1 / downscale:.0%} of its width; --evaluate.downscale {config.downscale:g} asks for more",
         )
     return config.model_copy(update={"photos": len(chosen), "downscale": downscale})
 
@@ -168,13 +171,17 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     test = scene.of_split("test")
     chosen = spread(len(test), min(config.photos or 0, len(test)))
     few = f"{len(chosen)} of {len(test)} test photos are scored, evenly spread"
-    notes = [few] if len(chosen) < len(test) else []
+    notes = [Note("evaluate.some-photos", few)] if len(chosen) < len(test) else []
     views = [test[i] for i in chosen]
     scored = [view for view in views if (used := examiner.used(view)) is None or used.any()]
     if len(scored) < len(views):
-        notes.append(f"masks leave nothing to compare of {_photos(len(views) - len(scored))} at this size")
+        notes.append(
+            Note(
+                "evaluate.masked", f"masks leave nothing to compare of {_photos(len(views) - len(scored))} at this size"
+            )
+        )
     for note in notes:
-        progress.note(note)
+        progress.note(*note)
     images = examiner.score(scored, progress)
     metrics = _overall(images, len(test), examiner.downscale, notes)
     metrics["background"] = examiner.renderer.background.tolist()
@@ -353,25 +360,27 @@ def verdict(metrics: dict[str, Any]) -> str:
     return what + "."
 
 
-def _overall(images: list[dict[str, Any]], test_photos: int, downscale: float, notes: list[str]) -> dict[str, Any]:
+def _overall(images: list[dict[str, Any]], test_photos: int, downscale: float, notes: list[Note]) -> dict[str, Any]:
     """The content of metrics.json."""
     metrics: dict[str, Any] = {key: _mean([image[key] for image in images]) for key in FIGURES}
     for key in ("psnr", "ssim"):
         values = [image[key] for image in images if image[key] is not None]
         metrics[f"{key}_interval"] = mean_interval(values)
     if not images:
-        notes = [*notes, f"{UNMEASURED[test_photos > 0]}, so nothing is measured"]
+        notes = [*notes, Note("evaluate.unmeasured", f"{UNMEASURED[test_photos > 0]}, so nothing is measured")]
     elif len(images) < MIN_FOR_INTERVAL:
-        notes = [*notes, f"no interval: {_photos(len(images))} cannot show how much the figures vary"]
+        words = f"no interval: {_photos(len(images))} cannot show how much the figures vary"
+        notes = [*notes, Note("evaluate.no-interval", words)]
     if small := sum(image["psnr_right_half"] is None for image in images):
-        notes = [*notes, f"a half of {_photos(small)} has too few pixels to fit an exposure on or to score with it"]
+        words = f"a half of {_photos(small)} has too few pixels to fit an exposure on or to score with it"
+        notes = [*notes, Note("evaluate.small-halves", words)]
     metrics |= {
         "lpips": None,
         "photos_scored": len(images),
         "photos_test": test_photos,
         "width_share": 1 / downscale,
         "error_scale": [0, ERROR_SCALE],
-        "notes": [*notes, NO_LPIPS],
+        "notes": [*(note.text for note in notes), NO_LPIPS],
         "images": images,
     }
     return metrics | {"verdict": verdict(metrics)}

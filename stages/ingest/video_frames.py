@@ -76,8 +76,9 @@ def take_frames(video: Path, most: int, folder: Path, progress: Progress) -> lis
         raise _no_way(video, frames)
     way = frames[-1].path
     progress.note(
+        "ingest.frames-taken",
         f"{len(chosen)} of {len(frames)} frames taken: the sharpest of each step of about "
-        f"{way / (len(chosen) - 1):.0%} of the picture's width, {way:.1f} widths in all"
+        f"{way / (len(chosen) - 1):.0%} of the picture's width, {way:.1f} widths in all",
     )
     return list(_write(video, frames, chosen, folder, progress))
 
@@ -139,7 +140,10 @@ def _measure(video: Path, progress: Progress) -> list[Frame]:
     if not frames:
         raise _undecodable("ingest.no-frame-decodes", video, "not one frame of it can be decoded")
     if lacks_frames(len(frames), announced):
-        progress.note(f"only {len(frames)} of {announced} frames of {video.name} can be decoded: is the file whole?")
+        progress.note(
+            "ingest.frames-missing",
+            f"only {len(frames)} of {announced} frames of {video.name} can be decoded: is the file whole?",
+        )
     return frames
 
 

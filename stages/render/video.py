@@ -67,7 +67,7 @@ def _affordable(
     drawn = measured_speed(train, lambda side: _tried_rays(path, scene, side), int(longest))
     speed = 1 / (1 / drawn + WRITING_SECONDS)
     frames, width = affordable(allowance.left() * speed, camera, longest, *asked)
-    progress.note(_why(path.resized(width), frames, speed, allowance, asked))
+    progress.note("render.size", _why(path.resized(width), frames, speed, allowance, asked))
     return frames, width
 
 
@@ -199,17 +199,26 @@ def as_asked(
     if photo is None:
         return renderer, words
     if renderer.model is renderer.field:
-        progress.note(f"exposure is not modelled: all photos count as exposed alike, and the video like {photo}")
+        progress.note(
+            "render.no-exposure",
+            f"exposure is not modelled: all photos count as exposed alike, and the video like {photo}",
+        )
         return renderer, words
     view = next((view for view in scene.views if view.name == photo), None)
     if view is None:
         near = difflib.get_close_matches(photo, [view.name for view in scene.views], n=3)
-        progress.note(f"no photo {photo} has a camera: {words}" + (f"; perhaps {', '.join(near)}" if near else ""))
+        progress.note(
+            "render.no-such-photo",
+            f"no photo {photo} has a camera: {words}" + (f"; perhaps {', '.join(near)}" if near else ""),
+        )
         return renderer, words
     as_photo = renderer.through(new_view_like(photo_effects(field, scene, view, renderer.device)))
     if any(photo in rows for rows in field["effects"].values()):
         return as_photo, f"exposed like {photo}"
-    progress.note(f"{photo} was not trained on: its exposure is what the photos taken nearest by let expect")
+    progress.note(
+        "render.expected-exposure",
+        f"{photo} was not trained on: its exposure is what the photos taken nearest by let expect",
+    )
     return as_photo, f"exposed as expected of {photo}"
 
 

@@ -5,6 +5,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from stages.contract import Note
 from stages.sfm import global_mapping
 from stages.sfm.colmap.diagnosis import compare_models
 from stages.sfm.colmap.mapping import incremental_options, map_globally, map_incrementally
@@ -94,7 +95,12 @@ def _checked(model: Any, other: Any, database: Path, matches: Path, options: Any
     best, sequence = (model, check_model(model, database, state.job.seed)), capture_sequence(database, state)
     if (failed := best[1].failed()) and not fragments_sequence(best[1], sequence):
         what = "contradict their verified matches" if best[1].check.misplaced.any() else "are not linked to the others"
-        state.send(note=f"{len(failed)} of {len(best[1].ids)} registered photos {what}: registering them again")
+        state.send(
+            note=Note(
+                "sfm.registered-again",
+                f"{len(failed)} of {len(best[1].ids)} registered photos {what}: registering them again",
+            )
+        )
         if other is not None:
             best = max(best, (other, check_model(other, database, state.job.seed)), key=_passing)
         if best[1].failed():

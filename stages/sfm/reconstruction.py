@@ -103,7 +103,9 @@ def _reconstruct(
     matches, conflict = read_matches(Path(found["database"])), found["conflict"]
     images = image_rows(names, matches, models, found["observations"], found["supports"], conflict, found["left_out"])
     if conflict:
-        progress.note(repeated_structure(conflict, {photo.image_name: photo.name for photo in photos}))
+        progress.note(
+            "sfm.repeated-structure", repeated_structure(conflict, {photo.image_name: photo.name for photo in photos})
+        )
     _note_unregistered(photos, images, progress)
     registration = _registration(
         "sfm",
@@ -183,9 +185,9 @@ def _database(folder: Path, names: Sequence[str], progress: Progress) -> Path:
         return database
     if _are_sound(folder / "strategies") and all(is_sound(one, names) for one in folder.glob("matches-*.db")):
         features, pairs = count_done(database)
-        progress.note(f"resuming with the features of {features} photos and {pairs} matched pairs")
+        progress.note("sfm.resumes", f"resuming with the features of {features} photos and {pairs} matched pairs")
     else:
-        progress.note("the matches of the interrupted run are damaged: starting over")
+        progress.note("sfm.damaged-matches", "the matches of the interrupted run are damaged: starting over")
         _remove_intermediate(folder)
     return database
 
@@ -234,10 +236,12 @@ def _georeference(folder: Path, photos: Sequence[Photo], progress: Progress) -> 
     centres = np.array([image.sfm_from_camera[:, 3] for image in located])
     found = georeference(centres, [position_of[image.file] for image in located])
     if isinstance(found, str):
-        progress.note(f"no metres from the photos' GPS: {found}")
+        progress.note("sfm.no-gps-scale", f"no metres from the photos' GPS: {found}")
         return None
     scale = f"one unit is {found.enu_from_sfm.scale:.3g} m"
-    progress.note(f"GPS of {found.used} photos: {scale}; positions are off by {found.error_m:.1f} m (median)")
+    progress.note(
+        "sfm.gps-scale", f"GPS of {found.used} photos: {scale}; positions are off by {found.error_m:.1f} m (median)"
+    )
     return found.to_json()
 
 
@@ -245,12 +249,14 @@ def _note_unregistered(photos: Sequence[Photo], images: list[dict[str, Any]], pr
     missing = [(photo.name, i["reason"]) for photo, i in zip(photos, images, strict=True) if not i["registered"]]
     if not missing:
         return
-    progress.note(f"{len(missing)} of {len(photos)} photos could not be registered and are left out:")
+    progress.note(
+        "sfm.unregistered", f"{len(missing)} of {len(photos)} photos could not be registered and are left out:"
+    )
     by_reason: dict[str, list[str]] = {}
     for name, reason in missing:
         by_reason.setdefault(reason, []).append(name)
     for reason, who in by_reason.items():
-        progress.note(f"  {listed(who, MAX_NAMES)}: {reason}")
+        progress.note("sfm.unregistered-reason", f"  {listed(who, MAX_NAMES)}: {reason}")
 
 
 def _skipped_for_time(strategies: Sequence[dict[str, Any]]) -> str:

@@ -44,7 +44,7 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 
 def latest_checkpoint(
     folder: Path,
-    note: Callable[[str], None],
+    note: Callable[[str, str], None],
     fits: Callable[[Checkpoint], None] = lambda _: None,
     remove: bool = True,
 ) -> Checkpoint | None:
@@ -65,7 +65,7 @@ def latest_checkpoint(
             wrong = f"is of no use ({fault})"
         except (RuntimeError, TypeError) as fault:
             wrong = f"is not of this training ({' '.join(str(fault).split())})"
-        note(f"the checkpoint of step {step} {wrong}; going back to the one before")
+        note("train.checkpoint-skipped", f"the checkpoint of step {step} {wrong}; going back to the one before")
         if remove:
             (folder / f"{step:09d}.json").unlink()
             (folder / f"{step:09d}.safetensors").unlink(missing_ok=True)

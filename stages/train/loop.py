@@ -78,7 +78,7 @@ class TrainingRun:
         else:
             self._resume(checkpoint)
         if words := lost_words(self.lost):
-            progress.note(words)
+            progress.note("train.lost-time", words)
 
     def train(self) -> None:
         """Train to the end of the budget. Raises StageError where the field diverges or stays dead."""
@@ -134,9 +134,11 @@ class TrainingRun:
         self._write_journal()
         self._save()
         self.log.event("extended", step, total_steps=self.plan.total_steps)
-        self.progress.note(f"going on from the {step:,} steps of the finished training, in {self.plan.total_steps:,}")
+        self.progress.note(
+            "train.more", f"going on from the {step:,} steps of the finished training, in {self.plan.total_steps:,}"
+        )
         if self.probes.target is not None and self.state.open_target(self.probes.target.psnr) is None:
-            self.progress.note(reached_before_words(self.probes.target.psnr))
+            self.progress.note("train.target-reached-before", reached_before_words(self.probes.target.psnr))
 
     def _limits(self) -> tuple[int | None, float | None]:
         """The steps or seconds after which the run ends at the latest, those of earlier runs included; of the seconds
@@ -162,7 +164,7 @@ class TrainingRun:
             self._write_journal()
         self._plan_checkpoint()
         self.log.event("resumed", self.state.step)
-        self.progress.note(going_on_words(self.state.step, self.plan.total_steps, left))
+        self.progress.note("train.resumes", going_on_words(self.state.step, self.plan.total_steps, left))
 
     def _load(self, checkpoint: Checkpoint, journal: Path) -> None:
         self.state = RunState(**checkpoint.facts)
@@ -275,7 +277,7 @@ class TrainingRun:
             self._write_journal()
             self.log.event("steered", step, total_steps=plan.total_steps)
             if plan.total_steps > step:
-                self.progress.note(steering_words(self.state, target.psnr, plan))
+                self.progress.note("train.target-steering", steering_words(self.state, target.psnr, plan))
 
     def _most_steps(self) -> int:
         """How many steps the budget allows for."""
@@ -312,7 +314,10 @@ class TrainingRun:
         elif symptom := symptom_of(self.trainer, self.probes.train):
             self.state.symptom = symptom
             self.log.event("unripe", self.state.step, symptom=symptom)
-            self.progress.note(f"after {self.state.step:,} steps the field is of no use yet: {symptom}; train longer")
+            self.progress.note(
+                "train.undertrained",
+                f"after {self.state.step:,} steps the field is of no use yet: {symptom}; train longer",
+            )
 
     def _examine_fully(self) -> None:
         if symptom := symptom_of(self.trainer, self.probes.train):
@@ -335,7 +340,7 @@ class TrainingRun:
             self.state.step, self.state.rollbacks = checkpoint.step, rollbacks
             self.state.curve = [point for point in self.state.curve if point["step"] <= checkpoint.step]
             self._plan_measurement()
-        self.progress.note(f"{fault}: back to step {self.state.step:,} at half the learning rate")
+        self.progress.note("train.rolled-back", f"{fault}: back to step {self.state.step:,} at half the learning rate")
 
     def _load_sound(self, checkpoint: Checkpoint) -> None:
         """Go back to it. Raises Lost where the field was dead already, as its batches tell only seconds later."""
@@ -366,7 +371,9 @@ class TrainingRun:
             why = f"after {WARM_UP_STEPS} steps {symptom}, with {restarts} different seeds"
             hint = "Check the cameras: the photos may not fit their poses. Or try a tenth of --train.learning-rate."
             raise StageError("train.collapsed", "the field does not learn", why, hint)
-        self.progress.note(f"after {WARM_UP_STEPS} steps the field is dead: {symptom}; starting with another seed")
+        self.progress.note(
+            "train.restarted", f"after {WARM_UP_STEPS} steps the field is dead: {symptom}; starting with another seed"
+        )
         shutil.rmtree(self.checkpoints)
         self._begin(self.state.anew(restarts, rollbacks=0))
 

@@ -10,7 +10,7 @@ from nerf.runtime.matmul_precision import use_matmul_precision
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.validation_probe import make_probe
 from stages.amounts import short_count
-from stages.contract import Inputs, Progress, StageResult
+from stages.contract import Inputs, Note, Progress, StageResult
 from stages.effects.decisions import read_decisions
 from stages.effects.image_effects import image_effects, learnt_effects
 from stages.hardware.device import compute_device, cores
@@ -61,7 +61,8 @@ def _with_photos_aside(target_psnr: float, scene: Scene, progress: Progress) -> 
     scene = with_validation(scene)
     aside, left = len(scene.of_split("validation")), len(scene.of_split("train"))
     progress.note(
-        f"{aside} of {aside + left} training photos are set aside to tell when {target_psnr:g} dB are reached"
+        "train.validation-photos",
+        f"{aside} of {aside + left} training photos are set aside to tell when {target_psnr:g} dB are reached",
     )
     return scene
 
@@ -107,9 +108,9 @@ def _say_sizes(config: Config, budget: TrainingBudget, dataset: RayDataset, prog
     photos = f"{len(dataset.near)} photos at 1/{config.downscale:g} of their size"
     field = field_of(config)
     sizes = f"{config.field} field ({field.sizes_in_words(config)})"
-    progress.note(f"{sizes}, {another}{much} · {photos}, {short_count(len(dataset.pixels))} pixels")
+    progress.note("train.sizes", f"{sizes}, {another}{much} · {photos}, {short_count(len(dataset.pixels))} pixels")
     if words := field.step_in_words(config):
-        progress.note(words)
+        progress.note("train.step", words)
 
 
 def compute(training: Training) -> None:
@@ -130,8 +131,8 @@ def save(training: Training, folder: Path, progress: Progress) -> StageResult:
     progress.update("measuring what this machine can do")
     with use_matmul_precision(config.matmul):
         parts = write_parts(folder, run.state.timings, config, run.probes.train.colours.device)
-    for words in _closing_notes(training):
-        progress.note(words)
+    for note in _closing_notes(training):
+        progress.note(*note)
     left_behind = sorted(path.name for path in folder.glob("nonfinite_*.safetensors"))
     board = ["tensorboard"] if config.tensorboard else []
     final = checkpoint_files(run.checkpoints, run.state.step)
@@ -139,12 +140,12 @@ def save(training: Training, folder: Path, progress: Progress) -> StageResult:
     return StageResult(("field.safetensors", "field.json"), _line(training), records, _facts(training))
 
 
-def _closing_notes(training: Training) -> list[str]:
+def _closing_notes(training: Training) -> list[Note]:
     """What the last doubling of the time bought, what the next is predicted to buy, and whether a target is reached."""
     state, config = training.run.state, training.config
     doubling = doubling_words(state.curve, coming_doubling(config.kind, training.run.plan.is_whole, state.curve))
     target = target_words(state.open_target(config.target_psnr), state.validation_psnr, state.seconds)
-    return [words for words in (doubling, target) if words]
+    return [Note(code, words) for code, words in (("train.doubling", doubling), ("train.target", target)) if words]
 
 
 def _facts(training: Training) -> dict[str, object]:

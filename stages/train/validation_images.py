@@ -62,7 +62,7 @@ def unseen_photos(
     except StageError as error:
         if split != "test" or error.code != ALL_MASKED:
             raise
-        progress.note(f"held-out quality is not measured while training: {error.why}")
+        progress.note("train.no-test-photos", f"held-out quality is not measured while training: {error.why}")
         return None
     shown_over = torch.tensor(field_background(config, scene), device=device)
     return Unseen(

@@ -26,6 +26,7 @@ from stages.io.field_files import load_field, save_field
 from stages.io.files import read_scene, read_tensors
 from stages.io.photos import read_frame_names, read_photos, write_photos
 from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
+from tests.refusals import unheard
 from tests.fuzz.cameras import photos_of
 from tests.fuzz.inputs import json_files, one_of
 
@@ -144,5 +145,5 @@ def checkpoint() -> dict[str, bytes]:
 
 
 def try_checkpoint(folder: Path) -> None:
-    if latest_checkpoint(folder, lambda _: None) is None:
+    if latest_checkpoint(folder, unheard) is None:
         raise StageError("train.no-state", "no checkpoint", "the only one is damaged", "-")

@@ -12,6 +12,7 @@ from PIL import Image
 
 from nerf.geometry.scene import Camera
 from stages import ingest, normalise, sfm
+from tests.refusals import codes
 from stages.ingest.decoding import upright
 from stages.io.colmap_files import PARAMETERS
 from stages.io.photos import Photo, read_photos
@@ -117,8 +118,7 @@ def test_cameras_of_stored_pixels_turn_with_their_photos(
     given = Camera("OPENCV", width, height, OPENCV.params)
     expected = places(width, height)[..., :2].reshape(-1, 2)
     np.testing.assert_array_equal(stored_places(model, pixels, given, ring(4)[0]), expected)
-    turned = "4 cameras are turned upright like their photos (EXIF orientation)"
-    assert (turned in progress.notes) == (orientation != 1)
+    assert ("sfm.turned-upright" in progress.codes) == (orientation != 1)
 
 
 @pytest.mark.parametrize("orientation", [3, 6])
@@ -166,8 +166,7 @@ def test_one_camera_that_only_fits_upright_tells_it_of_all(kind: str, alone: boo
         images = [SparseImage(name, i, pose) for i, (name, pose) in enumerate(zip(names, ring(5), strict=False))]
         write_model(tmp_path, SparseModel.without_points(cameras, images))
     known = read_poses(given, photos, {name: name for name in names})
-    turns = ["1 cameras are turned upright like their photos (EXIF orientation)"]
-    assert [note for note in known.notes if "turned" in note] == (turns if alone else [])
+    assert ("sfm.turned-upright" in codes(known.notes)) == alone
 
 
 def turned_photo(orientation: int, name: str = "p.jpg") -> Photo:
