@@ -133,7 +133,7 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
                 mean.add(step + 1)
         if step + 1 in due:
             as_expected = trainer.effects.of_held_out(bench.held_out)
-            models = {"heldout_psnr": trainer.model} | {name: mean.model for name, mean in means.items()}
+            models = {"probe_psnr": trainer.model} | {name: mean.model for name, mean in means.items()}
             psnr = {name: measure(model, bench.probe, as_expected).psnr for name, model in models.items()}
             points.append({"step": step + 1, "train_psnr": pace, **psnr})
     return {"rays": rays, "pixels": bench.dataset.unmasked_count, "points": points}
@@ -163,7 +163,7 @@ def main() -> None:
             clock = time.process_time()
             run |= train_run(bench, seed, steps, given.schedule)
             last = run["points"][-1]
-            psnr = " ".join(f"{name} {last[name]:.2f}" for name in ("train_psnr", "heldout_psnr", *MEANS))
+            psnr = " ".join(f"{name} {last[name]:.2f}" for name in ("train_psnr", "probe_psnr", *MEANS))
             what = f"{workspace.stem} {seed} {steps} {given.schedule} {given.constant}"
             print(what, psnr, f"{time.process_time() - clock:.0f} s", flush=True)
             runs.append(run)

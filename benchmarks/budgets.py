@@ -21,7 +21,6 @@ from pipeline.cli.durations import seconds_from
 
 SETS = ("fox", "fountain_p11", "fern", "banana", "demo")
 BUDGETS = ("2m", "5m", "15m")
-SCORED_SIDE = 480  # pixels of the longer side at which every field of a set is scored
 
 
 def main() -> None:
@@ -73,11 +72,8 @@ def _spent(name: str, budget: str, burning: bool, data: Path, folder: Path) -> f
 
 
 def _score(root: Path) -> float:
-    """PSNR on all test photos, reduced to SCORED_SIDE pixels whatever the field was trained at."""
-    photos = json.loads((root / "output/photos.json").read_text())["photos"]
-    longest = max(max(photo["width"], photo["height"]) for photo in photos)
-    flags = ["--evaluate.downscale", f"{max(1.0, longest / SCORED_SIDE):.3f}", "--evaluate.photos", str(len(photos))]
-    _pipeline("evaluate", str(root), *flags)
+    """PSNR of all pixels of all test photos, at their own size."""
+    _pipeline("evaluate", str(root), "--evaluate.fraction", "1")
     return json.loads((root / "output/metrics.json").read_text())["psnr"]
 
 

@@ -24,8 +24,6 @@ from stages.io.files import read_json, read_scene
 from stages.render.path import CameraPath, path_rays
 from stages.render.renderer import load_renderer
 
-EVERY_PHOTO = 10**6
-
 
 class Case(NamedTuple):
     """A set, photo width / trained width, seconds of training, and the width of the timed frame."""
@@ -64,7 +62,7 @@ def train(workspace: Path, case: Case) -> float:
     _, status, usage = os.wait4(process.pid, 0)
     if status:
         raise SystemExit(f"{' '.join(command)} ended with status {status}")
-    pipeline("evaluate", workspace, "--evaluate.photos", str(EVERY_PHOTO))
+    pipeline("evaluate", workspace, "--evaluate.fraction", "1")
     return usage.ru_maxrss / 1e6
 
 

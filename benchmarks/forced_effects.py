@@ -28,7 +28,6 @@ EFFECTS = ("exposure", "view_dependence", "background", "pose_refinement")
 FIGURES = {"raw": "psnr", "fitted": "psnr_exposure_fitted", "posed": "psnr_pose_fitted"}
 JUDGED_BY = {"pose_refinement": "posed"}  # the others: raw
 TOLERATED = 0.3  # dB
-EVERY_PHOTO = 10**6
 Scores = dict[str, dict[str, float | None]]
 """By the effect that is forced, "" for none, and the seed: the figures."""
 
@@ -51,7 +50,7 @@ def scored(
     pipeline("train", workspace, "--train.steps", str(steps), "--train.seed", str(seed))
     trained = read_json(stage_folder(workspace, "curve.json") / "field.json")["downscale"]
     size = ("--evaluate.downscale", str(downscale or trained))
-    pipeline("evaluate", workspace, "--evaluate.photos", str(EVERY_PHOTO), "--evaluate.fit-poses", "on", *size)
+    pipeline("evaluate", workspace, "--evaluate.fraction", "1", "--evaluate.fit-poses", "on", *size)
     metrics = read_json(stage_folder(workspace, "metrics.json") / "metrics.json")
     for output in ("metrics.json", "curve.json"):
         shutil.rmtree(stage_folder(workspace, output))

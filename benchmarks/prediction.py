@@ -23,7 +23,7 @@ from nerf.training.learning_curve import MIN_STEPS, Curve, last_doubling
 
 SHARE = 0.8  # of the truths that an interval is to hold
 LEAST = 0.1  # dB: by as much two seeds differ
-MEASURED = ("heldout_psnr", "mean_10")
+MEASURED = ("probe_psnr", "mean_10")
 Run = dict[str, Any]
 
 
@@ -51,13 +51,13 @@ MODELS: dict[str, Terms] = {
 IN_USE = "share of the last"
 
 
-def curve_of(run: Run, measured: str = "heldout_psnr") -> Curve:
+def curve_of(run: Run, measured: str = "probe_psnr") -> Curve:
     """(steps, dB): of a run on an idle machine steps and seconds differ by a factor."""
     return [(float(point["step"]), point[measured]) for point in run["points"]]
 
 
 def final(run: Run) -> float:
-    return run["points"][-1]["heldout_psnr"]
+    return run["points"][-1]["probe_psnr"]
 
 
 def in_use(run: Run) -> bool:

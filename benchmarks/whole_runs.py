@@ -42,7 +42,8 @@ def figures(name: str, root: Path, seconds: float) -> dict[str, Any]:
         row |= {key: manifests["train"]["facts"][key] for key in ("steps", "rays_per_second")}
     if "evaluate" in manifests:
         metrics = read_json(root / "output" / "metrics.json")
-        row |= {key: metrics[key] for key in ("psnr", "ssim", "width_share")}
+        row |= {key: metrics[key] for key in ("psnr", "ssim", "fraction")}
+        row["width_share"] = metrics["trained_size"][0] / metrics["scored_size"][0]
         row["above_nearest_db"] = round(metrics["psnr"] - metrics["psnr_nearest_view"], 1)
     return row
 

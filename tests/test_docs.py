@@ -11,7 +11,7 @@ from tyro.conf import Suppress
 from benchmarks import results
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from pipeline.engine.stage_list import STAGES
-from stages import evaluate
+from stages.evaluate.summary import FIGURES
 from stages.io.photos import Photo
 from tests.test_architecture import OURS
 from tests.wording import code_of, made
@@ -161,7 +161,7 @@ def test_examples_of_files_name_every_key():
     wanted = {
         "photos.json": {field.name for field in fields(Photo)},
         "scene.json": {field.name for kind in (Scene, View, Camera, Similarity) for field in fields(kind)},
-        "metrics.json": set(evaluate.FIGURES),
+        "metrics.json": set(FIGURES),
     }
     shown = {name: set(re.findall(r'"(\w+)"', page.split(f"## {name} ")[1].split("\n## ")[0])) for name in wanted}
     assert {name: keys - shown[name] for name, keys in wanted.items() if keys - shown[name]} == {}

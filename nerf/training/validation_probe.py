@@ -31,6 +31,11 @@ class Probe(NamedTuple):
         mean = self.colours.mean(0).expand_as(self.colours)
         return psnr(mean_squared_error(mean, self.colours))
 
+    def to(self, device: torch.device | str) -> "Probe":
+        """The same on another device."""
+        rays, *others = self
+        return Probe(rays.each(lambda part: part.to(device)), *(part.to(device) for part in others))
+
 
 class ProbeResult(NamedTuple):
     """PSNR in dB and mean opacity of a field on a probe."""
@@ -45,6 +50,10 @@ class Patches(NamedTuple):
 
     probe: Probe
     used: Bool[Tensor, "patches side side"]
+
+    def to(self, device: torch.device | str) -> "Patches":
+        """The same on another device."""
+        return Patches(self.probe.to(device), self.used.to(device))
 
 
 def make_probe(dataset: RayDataset, count: int, background: Float[Tensor, "3"], seed: int) -> Probe:

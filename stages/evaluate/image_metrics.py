@@ -15,30 +15,32 @@ MIN_FOR_INTERVAL = 3  # of two it would be thirteen times as wide as they differ
 
 
 def ssim(image: "Tensor", truth: "Tensor", used: "Tensor | None" = None) -> float | None:
-    """Mean structural similarity of two (H, W, 3) images in [0, 1]; None where no window fits in.
+    """Mean structural similarity of (H, W, 3) images, or of (n, H, W, 3) parts of one, in [0, 1]; None where no window
+    fits in.
 
     Wang et al. 2004: Gaussian window of 11 pixels and sigma 1.5, only where the window lies inside the image,
     so it equals scikit-image's ``structural_similarity(gaussian_weights=True, use_sample_covariance=False)``.
-    With ``used``, (H, W) bool, only where all of the window is used.
+    With ``used``, ([n,] H, W) bool, only where all of the window is used.
     """
     from kornia.metrics import ssim as kornia_ssim
 
-    if min(image.shape[:2]) < SSIM_WINDOW:
+    height, width, channels = image.shape[-3:]
+    if min(height, width) < SSIM_WINDOW:
         return None
-    batch = (picture.permute(2, 0, 1)[None] for picture in (image, truth))
-    similarity = kornia_ssim(*batch, window_size=SSIM_WINDOW, eps=0.0, padding="valid")[0]
+    batch = (picture.reshape(-1, height, width, channels).permute(0, 3, 1, 2) for picture in (image, truth))
+    similarity = kornia_ssim(*batch, window_size=SSIM_WINDOW, eps=0.0, padding="valid").transpose(0, 1)
     if used is None:
         return float(similarity.mean())
-    inside = _windows_inside(used)
+    inside = _windows_inside(used.reshape(-1, height, width))
     return float(similarity[:, inside].mean()) if inside.any() else None
 
 
 def _windows_inside(used: "Tensor") -> "Tensor":
-    """Where all of an SSIM window is used, (H - 10, W - 10) bool."""
+    """Where all of an SSIM window is used, (n, H - 10, W - 10) bool."""
     from torch.nn.functional import max_pool2d
 
-    ignored = (~used).float()[None, None]
-    return max_pool2d(ignored, SSIM_WINDOW, stride=1)[0, 0] == 0
+    ignored = (~used).float()[:, None]
+    return max_pool2d(ignored, SSIM_WINDOW, stride=1)[:, 0] == 0
 
 
 def error_map(image: "Tensor", truth: "Tensor", used: "Tensor | None" = None) -> "np.ndarray":

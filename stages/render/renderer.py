@@ -83,16 +83,18 @@ def load_renderer(
 
 class Allowance:
     """Seconds of drawing for a stage that begins now: what is left of ``seconds`` given to it, less ``beside`` for all
-    else that it does; a share of the training's where none are given."""
+    else that it does; where none are given a ``share`` of the training's, ``at_least`` so many."""
 
-    def __init__(self, seconds: float | None, train: Path, beside: float) -> None:
+    def __init__(
+        self, seconds: float | None, train: Path, beside: float, share: float = SHARE, at_least: float = 0.0
+    ) -> None:
         self.began, self.given, self.beside = time.perf_counter(), seconds, beside
-        self.trained = trained_seconds(train)
+        self.trained, self.share, self.at_least = trained_seconds(train), share, at_least
 
     def left(self) -> float:
         """Seconds that pictures may take."""
         if self.given is None:
-            return SHARE * self.trained
+            return max(self.at_least, self.share * self.trained)
         return max(MIN_DRAWING, self.given - (time.perf_counter() - self.began) - self.beside)
 
     def words(self) -> str:

@@ -17,6 +17,7 @@ from tyro.conf import Suppress
 from nerf.geometry.scene import Scene
 from stages.amounts import duration, short_count
 from stages.contract import Inputs
+from stages.evaluate.summary import scored_on
 from stages.io.ascii_names import shell_quoted
 from stages.io.files import read_json, read_scene, read_tensors
 from stages.io.pixels import load_pixels, pillow
@@ -31,7 +32,7 @@ from stages.report.cameras import (
     uncertainty,
 )
 from stages.report.effects import effects_table
-from stages.report.plots import ORDER_COLOURS, camera_svgs, curve_svg
+from stages.report.plots import ORDER_COLOURS, Score, camera_svgs, curve_svg
 from stages.report.profile import parts_bar
 from stages.tradeoff.plots import COLUMNS, plot_svg, rendering_sentence, table_cells
 from stages.train.curve import coming_doubling, doubling_words, knee_words, more_option, ssim_words
@@ -106,6 +107,7 @@ def summarise(results: Results) -> dict[str, Any]:
         "expected_seconds": _expected(manifests),
         "training_parts": results.parts,
         **{key: metrics.get(key) for key in ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")},
+        "scored_fraction": metrics.get("fraction"),
         "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
         "verdict": metrics.get("verdict", "Not measured: stage evaluate has not run."),
     }
@@ -147,6 +149,7 @@ def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
         curve=_curve(results),
         parts=parts_bar(results.parts),
         metrics=results.metrics,
+        scored_on=scored_on(results.metrics) if results.metrics and results.metrics["images"] else None,
         compared=_compared(results),
         video=_video(results.inputs, config.video_limit_mb),
         **_mesh_part(results),
@@ -265,7 +268,9 @@ def _curve(results: Results) -> dict[str, Any] | None:
     points, metrics = results.curve["points"], results.metrics or {}
     baselines = {"nearest training view": "psnr_nearest_view", "mean image": "psnr_mean_image"}
     coming = coming_doubling(results.curve["field"], results.curve["whole"], points)
-    svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming)
+    scored = metrics.get("psnr") is not None
+    score = Score(metrics["psnr"], metrics["psnr_interval"]) if scored else None
+    svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming, score)
     if svg is None:
         return None
     words = [doubling_words(points, coming), knee_words(points), ssim_words(points)]

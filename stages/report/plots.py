@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,7 +18,7 @@ from nerf.training.learning_curve import Gain, knee, quality_at
 from stages.amounts import duration
 from stages.io.figures import INK, svg_element, svg_figure
 from stages.sfm.pairs.match_graph import natural_order
-from stages.train.curve import heldout_curve
+from stages.train.curve import probe_curve
 
 BLUE, ORANGE, GREY = "#3b82f6", "#f2711c", "#8a8f98"
 ORDER_COLOURS = (BLUE, "#9b5de5", "#e0457b", ORANGE, "#e0a800")  # from first to last, legible on light and dark pages
@@ -27,39 +27,58 @@ MAX_POINTS = 20_000
 ROOM_BELOW = 0.08  # of the curve's height, so that the name of the lowest line stands clear of the times
 
 
+class Score(NamedTuple):
+    """PSNR of the finished field (dB), and the interval of that."""
+
+    psnr: float
+    interval: Sequence[float] | None
+
+
 def curve_svg(
-    points: Sequence[dict[str, Any]], baselines: dict[str, float | None], coming: Gain | None = None
+    points: Sequence[dict[str, Any]],
+    baselines: dict[str, float | None],
+    coming: Gain | None = None,
+    score: Score | None = None,
 ) -> str | None:
     """PSNR against training seconds, one grid line per doubling of the time, with the knee and what is ``coming``, what
     the next doubling is predicted to buy; None for fewer than two points. ``baselines`` are drawn as horizontal lines
-    under their names.
+    under their names, the ``score`` of the finished field at the end of the curve.
     """
     rows = [row for row in points if row["seconds"] > 0]
     if len(rows) < 2:
         return None
     with svg_figure((8.2, 3.4), "curve") as figure:
         axes = figure.add_subplot()
-        for key, label, colour in (("train_psnr", "training rays", GREY), ("heldout_psnr", "held-out photos", BLUE)):
+        for key, label, colour in (("train_psnr", "training rays", GREY), ("probe_psnr", "test pixels", BLUE)):
             seen = [(row["seconds"], row[key]) for row in rows if row[key] is not None]
             if seen:
                 axes.plot(*zip(*seen, strict=True), color=colour, lw=2, marker="o", ms=3, label=label)
         if coming is not None:
             _draw_prediction(axes, rows, coming)
         last = rows[-1]["seconds"] * (1 if coming is None else 2)
-        _draw_knee(axes, heldout_curve(rows))
+        _draw_knee(axes, probe_curve(rows))
+        if score is not None:
+            _draw_score(axes, rows[-1]["seconds"], score)
         # Last, for they fix the limits, beyond which nothing is seen.
         _draw_baselines(axes, {name: psnr for name, psnr in baselines.items() if psnr is not None})
         _doubling_axis(axes, rows[0]["seconds"], rows[-1]["seconds"], last)
         axes.set(xlabel="training time", ylabel="PSNR (dB)")
-        axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=4, borderaxespad=0)
+        axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=5, borderaxespad=0)
         return svg_element(figure)
 
 
 def _draw_prediction(axes: Axes, rows: Sequence[dict[str, Any]], coming: Gain) -> None:
     """A dotted line on to twice the time, with its interval."""
-    (seconds, psnr), style = heldout_curve(rows)[-1], {"color": BLUE, "lw": 1.5, "ls": (0, (1, 1.5))}
+    (seconds, psnr), style = probe_curve(rows)[-1], {"color": BLUE, "lw": 1.5, "ls": (0, (1, 1.5))}
     axes.plot([seconds, 2 * seconds], [psnr, psnr + coming.db], label="predicted", **style)
     axes.errorbar(2 * seconds, psnr + coming.db, coming.half_width, color=BLUE, capsize=4, lw=1.5)
+
+
+def _draw_score(axes: Axes, seconds: float, score: Score) -> None:
+    """What stage evaluate found, with its interval: of all test photos, where the curve knows some of their pixels."""
+    low, high = score.interval or (score.psnr, score.psnr)
+    style = {"color": INK, "fmt": "D", "ms": 6, "capsize": 4, "lw": 1.5, "zorder": 4}
+    axes.errorbar(seconds, score.psnr, [[score.psnr - low], [high - score.psnr]], label="score, test photos", **style)
 
 
 def _draw_knee(axes: Axes, curve: Sequence[tuple[float, float]]) -> None:

@@ -43,8 +43,8 @@ class Config(StageConfig):
         default=None,
         gt=0,
         le=100,
-        description="stop once so many dB are reached on photos set aside from the training photos; at the latest "
-        "when the time or the steps are used up",
+        description="stop once so many dB are reached on validation photos, set aside from the training photos; at "
+        "the latest when the time or the steps are used up",
     )
     learning_rate: float | None = Field(default=None, gt=0, description="at the start; none: by the field")
     seed: int = Field(default=0, description="of weights, batches and samples")

@@ -1,9 +1,10 @@
 """curve.json: quality against training time, and what it says in words.
 
 ``{"field": "grid" | "paper", "downscale", "device": "cpu" | "cuda", "threads", "whole", "points": [{"step", "seconds",
-"train_psnr", "heldout_psnr", "heldout_ssim"} …]}``; what cannot be measured is null. ``downscale`` is that of the
-photos, those measured on included. Seconds are those of training steps alone: measuring is not among them. ``whole``:
-the rate fell once, at the end, and never rose again to go on.
+"train_psnr", "probe_psnr", "probe_ssim"} …]}``; what cannot be measured is null. ``downscale`` is that of the
+photos trained on. ``probe_psnr`` is of a fixed sample of pixels of all test photos, taken together, at the size at
+which photos are scored: it follows the score, PSNR of stage evaluate, and is not it. Seconds are those of training
+steps alone: measuring is not among them. ``whole``: the rate fell once, at the end, and never rose again to go on.
 """
 
 from collections.abc import Sequence
@@ -25,9 +26,9 @@ def write_curve(folder: Path, field: str, downscale: float, whole: bool, points:
     write_json(folder / "curve.json", about | {"points": points})
 
 
-def heldout_curve(points: Sequence[dict[str, Any]]) -> list[tuple[float, float]]:
-    """(seconds, dB on held-out photos), as nerf/training/learning_curve.py reads it."""
-    known = ((point["seconds"], point["heldout_psnr"]) for point in points)
+def probe_curve(points: Sequence[dict[str, Any]]) -> list[tuple[float, float]]:
+    """(seconds, dB on the test probe), as nerf/training/learning_curve.py reads it."""
+    known = ((point["seconds"], point["probe_psnr"]) for point in points)
     return [(seconds, psnr) for seconds, psnr in known if psnr is not None and seconds > 0]
 
 
@@ -35,18 +36,16 @@ def coming_doubling(field: str, whole: bool, points: Sequence[dict[str, Any]]) -
     """What the next doubling of the time is predicted to buy at the same sizes of photos and field, as ``--more`` keeps
     them; None where the curve is too short, and for what the prediction was not fitted to: the paper's field, whose
     rate falls all the way, and a run that is not ``whole``, where half of the time may have ended annealed, too."""
-    return next_doubling(heldout_curve(points), points[-1]["step"]) if points and field == "grid" and whole else None
+    return next_doubling(probe_curve(points), points[-1]["step"]) if points and field == "grid" and whole else None
 
 
 def doubling_words(points: Sequence[dict[str, Any]], coming: Gain | None) -> str | None:
     """What the last doubling of the time bought and what is ``coming``; None where the curve is too short."""
-    curve = heldout_curve(points)
+    curve = probe_curve(points)
     last = last_doubling(curve)
     if last is None:
         return None
-    words = (
-        f"the last doubling of training time, to {duration(curve[-1][0])}, bought {last:+z.1f} dB on held-out photos"
-    )
+    words = f"the last doubling of training time, to {duration(curve[-1][0])}, bought {last:+z.1f} dB on test pixels"
     if coming is None:
         return words
     words += " (less over a run of half the time, which would have ended above this curve)"
@@ -70,13 +69,13 @@ def target_words(target: float | None, reached: float | None, seconds: float) ->
     if target is None or reached is None:
         return None
     if reached >= target:
-        return f"{target:g} dB reached after {duration(seconds)}, on photos set aside"
-    return f"{target:g} dB not reached in {duration(seconds)}: {reached:.1f} on photos set aside"
+        return f"{target:g} dB reached after {duration(seconds)}, on validation photos"
+    return f"{target:g} dB not reached in {duration(seconds)}: {reached:.1f} on validation photos"
 
 
 def knee_words(points: Sequence[dict[str, Any]]) -> str | None:
     """Where the knee is, or that there is none; None where the curve is too short to tell."""
-    curve = heldout_curve(points)
+    curve = probe_curve(points)
     if last_doubling(curve) is None:
         return None
     at = knee(curve)
@@ -87,7 +86,7 @@ def knee_words(points: Sequence[dict[str, Any]]) -> str | None:
 
 def ssim_words(points: Sequence[dict[str, Any]]) -> str | None:
     """SSIM at the end and half of the time before; None where it is not known."""
-    known = [(p["seconds"], p["heldout_ssim"]) for p in points if p["heldout_ssim"] is not None and p["seconds"] > 0]
+    known = [(p["seconds"], p["probe_ssim"]) for p in points if p["probe_ssim"] is not None and p["seconds"] > 0]
     if len(known) < 2 or known[0][0] > known[-1][0] / 2:
         return None
     before, after = quality_at(known, known[-1][0] / 2), known[-1][1]
@@ -98,7 +97,7 @@ def ssim_words(points: Sequence[dict[str, Any]]) -> str | None:
 
 def sparkline(points: Sequence[dict[str, Any]]) -> str:
     """Held-out PSNR from the first measurement to the last, even in log time; "" for fewer than three."""
-    curve = heldout_curve(points)
+    curve = probe_curve(points)
     if len(curve) < 3:
         return ""
     first, ratio = curve[0][0], curve[-1][0] / curve[0][0]

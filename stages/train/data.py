@@ -30,25 +30,34 @@ if TYPE_CHECKING:
 # Along the longer side of a picture. At 1000 pixels the directions are then off by at most 0.002 of them for a phone's
 # lens, 0.02 for an action camera's, 0.05 for a fisheye's, and a camera takes 1 MB; twice as many: a quarter, and 4 MB.
 MAX_PATCHES = 192
+# Of the longer side of a photo as it is scored: the convention of 3D Gaussian Splatting (Kerbl et al. 2023) and of
+# nerfbaselines, by which figures of different methods can be compared.
+MAX_SCORED_SIDE = 1600
 MIN_LONG_SIDE = 150  # pixels of a photo: below this it shows too little to judge anything by
 ALL_MASKED = "train.all-masked"  # the error where masks leave no pixel at a size
 
 
-def scaled_size(camera: "Camera", downscale: float) -> tuple[int, int]:
-    """(width, height) of a camera's photos made ``downscale`` times smaller, rounded half up, at least one pixel."""
+def scaled_size(camera: "Camera", downscale: float | None) -> tuple[int, int]:
+    """(width, height) of a camera's photos made ``downscale`` times smaller, rounded half up, at least one pixel.
+
+    None, here and wherever a ``downscale`` is asked for: the size at which photos are scored, their own one up to
+    MAX_SCORED_SIDE pixels of the longer side.
+    """
+    if downscale is None:
+        downscale = max(1.0, max(camera.width, camera.height) / MAX_SCORED_SIDE)
     return max(1, int(camera.width / downscale + 0.5)), max(1, int(camera.height / downscale + 0.5))
 
 
-@lru_cache(maxsize=1)
-def camera_directions(camera: "Camera", downscale: float) -> "Tensor":
+@lru_cache(maxsize=2)
+def camera_directions(camera: "Camera", downscale: float | None) -> "Tensor":
     """The unit direction vectors (H, W, 3) of a camera's pixel centres at a reduced size; not to be written to.
 
-    The last answer is kept: photos of one camera mostly follow each other.
+    The last two answers are kept: photos of one camera mostly follow each other, some of them at two sizes.
     """
     return torch.from_numpy(camera_rays(camera, *scaled_size(camera, downscale)))
 
 
-def patch_directions(camera: "Camera", downscale: float) -> "Tensor":
+def patch_directions(camera: "Camera", downscale: float | None) -> "Tensor":
     """Bearing vectors (rows, columns, 3) of a camera in the middles of the patches that stand for its pixels in a ray
     dataset, MAX_PATCHES along the longer side or one per pixel."""
     width, height = scaled_size(camera, downscale)
@@ -56,7 +65,9 @@ def patch_directions(camera: "Camera", downscale: float) -> "Tensor":
     return torch.from_numpy(camera_rays(camera, math.ceil(width / shrink), math.ceil(height / shrink)))
 
 
-def training_dataset(ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress) -> RayDataset:
+def training_dataset(
+    ingest: Path, scene: "Scene", split: "Split", downscale: float | None, progress: Progress
+) -> RayDataset:
     """All pixels and rays of one split, on the CPU; the pixels are mapped from the pixel store, which is made if need
     be. What masks ignore is never drawn. Raises StageError, ALL_MASKED, where they leave nothing."""
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
@@ -126,14 +137,14 @@ def _masked(dataset: RayDataset, ignored: "Iterable[Tensor | None]", split: "Spl
     return dataset
 
 
-def view_mask(ingest: Path, scene: "Scene", view: "View", downscale: float) -> "Tensor | None":
+def view_mask(ingest: Path, scene: "Scene", view: "View", downscale: float | None) -> "Tensor | None":
     """Which pixels of a view are to be used, (H, W) bool; None: all of them."""
     if view.mask is None:
         return None
     return torch.from_numpy(load_mask(ingest / view.mask, *scaled_size(scene.cameras[view.camera], downscale)))
 
 
-def view_rays(scene: "Scene", view: "View", downscale: float) -> Rays:
+def view_rays(scene: "Scene", view: "View", downscale: float | None) -> Rays:
     """One ray per pixel of a view, (H, W), on the CPU."""
     pose = torch.tensor(view.scene_from_camera, dtype=torch.float32)
     return rays_of_view(camera_directions(scene.cameras[view.camera], downscale), pose, view.near, view.far)
@@ -143,7 +154,7 @@ class PhotoReader:
     """The photos of a scene at 1/``downscale`` of their size, one by one. To be held while many are read: where those
     of a split are stored is told by a look at every one of them, once."""
 
-    def __init__(self, ingest: Path, scene: "Scene", downscale: float) -> None:
+    def __init__(self, ingest: Path, scene: "Scene", downscale: float | None) -> None:
         self.ingest, self.scene, self.downscale = ingest, scene, downscale
         self._stores: dict[Split, tuple[PixelStore, dict[str, int]]] = {}
 
@@ -163,14 +174,14 @@ class PhotoReader:
         return _decoded_pixels(self.ingest, self.scene, view, self.downscale) if stored is None else stored
 
 
-def _store(ingest: Path, scene: "Scene", split: "Split", downscale: float) -> PixelStore:
+def _store(ingest: Path, scene: "Scene", split: "Split", downscale: float | None) -> PixelStore:
     """Where the pixels of one split at this size are kept, whether or not they are there yet."""
     views = scene.of_split(split)
     photos = [StoredPhoto(view.file, *scaled_size(scene.cameras[view.camera], downscale)) for view in views]
     return pixel_store(ingest, split, photos, 4 if scene.has_alpha else 3)
 
 
-def _decoded_pixels(ingest: Path, scene: "Scene", view: "View", downscale: float) -> np.ndarray:
+def _decoded_pixels(ingest: Path, scene: "Scene", view: "View", downscale: float | None) -> np.ndarray:
     """The photo of a view as uint8: (H, W, 4) in a scene with alpha, else (H, W, 3) as it is below its alpha."""
     pixels = load_pixels(ingest / view.file, *scaled_size(scene.cameras[view.camera], downscale))
     if scene.has_alpha and pixels.shape[2] == 3:  # a photo without transparent parts covers every pixel

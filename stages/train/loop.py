@@ -228,12 +228,12 @@ class TrainingRun:
         """Add a point to the curve. Not training time, and without influence on what is trained."""
         load_metrics()
         started = time.perf_counter()
-        seen = look(self.trainer, self.probes.heldout) if self.probes.heldout else None
+        seen = look(self.trainer, self.probes.test) if self.probes.test else None
         # Right after a kill at the very end no step has told how well the batches go.
         train = self.pace.psnr if self.pace.count else self._on_training_photos().psnr
         point = {"step": self.state.step, "seconds": round(self.state.seconds, 3), "train_psnr": round(train, 3)}
-        point["heldout_psnr"] = None if seen is None else round(seen.psnr, 3)
-        point["heldout_ssim"] = None if seen is None or seen.ssim is None else round(seen.ssim, 4)
+        point["probe_psnr"] = None if seen is None else round(seen.psnr, 3)
+        point["probe_ssim"] = None if seen is None or seen.ssim is None else round(seen.ssim, 4)
         self.state.curve.append(point)
         self.log.point(point)
         if self.probes.target is not None:
@@ -389,10 +389,10 @@ class TrainingRun:
 
 def live_words(state: RunState, pace: Pace, left: float) -> str:
     """Step, speed, quality and the seconds left; of a run that knows its pace."""
-    measured = [point["heldout_psnr"] for point in state.curve if point["heldout_psnr"] is not None]
-    heldout = f" · held out {measured[-1]:.1f} dB" if measured else ""
+    measured = [point["probe_psnr"] for point in state.curve if point["probe_psnr"] is not None]
+    test = f" · {measured[-1]:.1f} dB on test pixels" if measured else ""
     speed = f"{short_count(pace.rays_per_step / pace.seconds_per_step)} rays/s"
-    return f"step {state.step:,} · {speed} · train {pace.psnr:.1f} dB{heldout} · {left:.0f} s left"
+    return f"step {state.step:,} · {speed} · train {pace.psnr:.1f} dB{test} · {left:.0f} s left"
 
 
 def going_on_words(step: int, total_steps: int, left: float | None) -> str:
@@ -415,6 +415,6 @@ def reached_before_words(target_psnr: float) -> str:
 
 def steering_words(state: RunState, target_psnr: float, plan: StepSchedule) -> str:
     """That the rate falls before the end, or goes back up, with a target in mind."""
-    seen = f"{state.validation_psnr:.1f} of {target_psnr:g} dB on photos set aside after {state.step:,} steps"
+    seen = f"{state.validation_psnr:.1f} of {target_psnr:g} dB on validation photos after {state.step:,} steps"
     and_now = "annealing over" if plan.decisions[-1].reason == "target" else "going on for"
     return f"{seen}: {and_now} {plan.total_steps - state.step:,} more"

@@ -28,11 +28,11 @@ class TrainingBudget(NamedTuple):
 
 
 class Probes(NamedTuple):
-    """Fixed pixels to measure on; ``heldout`` is None without test photos, is reported and decides nothing. A
+    """Fixed pixels to measure on; ``test`` is None without test photos, is reported and decides nothing. A
     ``target`` decides when to stop."""
 
     train: "Probe"
-    heldout: "Unseen | None" = None
+    test: "Unseen | None" = None
     target: "Target | None" = None
 
 
@@ -117,7 +117,7 @@ class TrainingLog:
         """Record one point of the curve."""
         self.event("measured", **point)
         if self.board is not None:
-            for name in ("train_psnr", "heldout_psnr", "heldout_ssim"):
+            for name in ("train_psnr", "probe_psnr", "probe_ssim"):
                 if point[name] is not None:
                     self.board.add_scalar(name, point[name], point["step"])
             self.board.flush()

@@ -158,7 +158,7 @@ def _facts(training: Training) -> dict[str, object]:
         "rays_per_second": round(state.rays / state.seconds, 1),
         "samples_per_second": round(state.samples / state.seconds, 1),
         "train_psnr": last["train_psnr"],
-        "heldout_psnr": last["heldout_psnr"],
+        "probe_psnr": last["probe_psnr"],
         "validation_psnr": state.validation_psnr,
         "curve": state.curve[-5:],
         "downscale": config.downscale,
@@ -170,16 +170,16 @@ def _facts(training: Training) -> dict[str, object]:
 
 
 def _line(training: Training) -> str:
-    """180 s · 5.4 k steps · 24 k rays/s · held out 28.9 dB, over time ▁▃▅▆▇█ · as long again (--more 3m) is predicted
-    to buy +0.6 ± 0.4 dB."""
+    """180 s · 5.4 k steps · 24 k rays/s · 28.9 dB on test pixels, over time ▁▃▅▆▇█ · as long again (--more 3m) is
+    predicted to buy +0.6 ± 0.4 dB."""
     config, state = training.config, training.run.state
-    heldout = state.curve[-1]["heldout_psnr"]
+    probe = state.curve[-1]["probe_psnr"]
     before = "" if config.after is None else f", {state.seconds_before:.0f} s of them before"
     parts: list[str | None] = [f"{state.seconds:.0f} s{before}"]
     parts += [f"{short_count(state.step)} steps", f"{short_count(state.rays / state.seconds)} rays/s"]
     spark = sparkline(state.curve)
     rising = f", over time {spark}" if spark else ""
-    parts.append("no photos held out" if heldout is None else f"held out {heldout:.1f} dB{rising}")
+    parts.append("no test photos" if probe is None else f"{probe:.1f} dB on test pixels{rising}")
     parts.append(next_words(state.curve, coming_doubling(config.kind, training.run.plan.is_whole, state.curve)))
     parts.append(target_words(state.open_target(config.target_psnr), state.validation_psnr, state.seconds))
     if state.symptom is not None:

@@ -52,22 +52,21 @@ class Look(NamedTuple):
 def unseen_photos(
     config: Config, ingest: Path, scene: Scene, split: Split, device: str, progress: Progress
 ) -> Unseen | None:
-    """Of the photos of a split; None where it has none, or where masks leave nothing of its test photos, which decide
-    nothing: then ``progress`` is told. Always the same pixels."""
+    """Of the photos of a split, at the size at which photos are scored; None where it has none, or where masks leave
+    nothing of its test photos, which decide nothing: then ``progress`` is told. Always the same pixels."""
     if not scene.of_split(split):
         return None
-    assert config.downscale is not None, "plan() chooses it"
     try:
-        dataset = training_dataset(ingest, scene, split, config.downscale, progress).to(device)
+        dataset = training_dataset(ingest, scene, split, None, progress)
     except StageError as error:
         if split != "test" or error.code != ALL_MASKED:
             raise
-        progress.note("train.no-test-photos", f"held-out quality is not measured while training: {error.why}")
+        progress.note("train.no-test-photos", f"test photos are not measured while training: {error.why}")
         return None
-    shown_over = torch.tensor(field_background(config, scene), device=device)
+    shown_over = torch.tensor(field_background(config, scene))
     return Unseen(
-        make_probe(dataset, PROBE_RAYS, shown_over, PROBE_SEED),
-        make_patches(dataset, PATCHES, PATCH_SIDE, shown_over, PROBE_SEED),
+        make_probe(dataset, PROBE_RAYS, shown_over, PROBE_SEED).to(device),
+        make_patches(dataset, PATCHES, PATCH_SIDE, shown_over, PROBE_SEED).to(device),
         held_out_images(scene.of_split("train"), scene.of_split(split), device),
     )
 

@@ -51,7 +51,7 @@ def test_every_field_and_backend(chain: Chain, tmp_path: Path, kind: str):
         tiny = "--train.levels 2 --train.log2-rows 10 --train.finest 32 --train.batch-samples 1024 --train.chunks 2"
         sizes = "" if kind == "paper" else tiny
         words = f"run {chain.photos} -o {workspace} --until evaluate {sizes} {FIELDS[kind]}"
-        words += " --train.downscale 1 --evaluate.photos 2"
+        words += " --train.downscale 1 --evaluate.fraction 1"
         Program(words.split(), tmp_path / "says", Threads(count)).finish()
         found.append(results(workspace))
     assert found[0] == found[1] == found[2] and {"train", "evaluate"} <= found[0].keys()

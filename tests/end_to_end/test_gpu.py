@@ -29,11 +29,11 @@ def trained(workspace: Path) -> Path:
     return (workspace / "output/curve.json").resolve().parent
 
 
-def heldout_psnr(photos: Path, workspace: Path, *flags: str) -> float:
+def probe_psnr(photos: Path, workspace: Path, *flags: str) -> float:
     assert run_command(["run", str(photos), "-o", str(workspace), "--until", "train", *flags]) == 0
     curve = read_json(trained(workspace) / "curve.json")
     assert curve["device"] == "cuda"
-    return curve["points"][-1]["heldout_psnr"]
+    return curve["points"][-1]["probe_psnr"]
 
 
 def test_the_chain_on_a_gpu_agrees_with_the_cpu(tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_both_backends_train_lego(shared_data: Path, tmp_path: Path) -> None:
     if not (photos := shared_data / "lego_400").is_dir():
         pytest.skip(f"no photos at {photos}")
     by_torch, by_warp = (
-        heldout_psnr(photos, tmp_path / f"{name}.nerf", *flags, "--train.backend", name) for name in ("torch", "warp")
+        probe_psnr(photos, tmp_path / f"{name}.nerf", *flags, "--train.backend", name) for name in ("torch", "warp")
     )
     assert min(by_torch, by_warp) > 22
     assert abs(by_torch - by_warp) < 0.5

@@ -26,9 +26,9 @@ from stages.io.field_files import load_field, save_field
 from stages.io.files import read_scene, read_tensors
 from stages.io.photos import read_frame_names, read_photos, write_photos
 from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
-from tests.refusals import unheard
 from tests.fuzz.cameras import photos_of
 from tests.fuzz.inputs import json_files, one_of
+from tests.refusals import unheard
 
 TOML = b"""[train]
 steps = 500

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 from torch import Tensor
 
@@ -19,7 +17,9 @@ from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages import evaluate
-from stages.evaluate import affordable
+from stages.evaluate import planning, seconds
+from stages.evaluate.image_metrics import ssim
+from stages.evaluate.summary import FIGURES
 from stages.io.files import write_json, write_png
 from tests.refusals import refused
 
@@ -62,10 +62,11 @@ def _view(index: int, name: str, split: Any) -> View:
     return View(name, f"images/{Path(name).stem}.png", 0, pose, 0.1, 4.0, split)
 
 
-def _photo(view: View, alpha: bool) -> Image.Image:
-    """What a pinhole camera sees of the sky, computed from scratch."""
-    x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
-    ray_directions = np.stack([x, y, np.full_like(x, FOCAL)], -1)
+def _photo(view: View, alpha: bool, scale: int) -> Image.Image:
+    """What a pinhole camera sees of the sky, computed from scratch; so many times larger."""
+    width, height = scale * WIDTH, scale * HEIGHT
+    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+    ray_directions = np.stack([x, y, np.full_like(x, scale * FOCAL)], -1)
     directions = (
         ray_directions / np.linalg.norm(ray_directions, axis=-1, keepdims=True) @ view.scene_from_camera[:, :3].T
     )
@@ -84,7 +85,13 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
     """Finished folders for a scene of the sky and a field of it."""
 
     def build(
-        field: SkyField | None = None, *, tests: int = 4, speed: int = 10**9, downscale: float = 1, alpha: bool = False
+        field: SkyField | None = None,
+        *,
+        tests: int = 4,
+        speed: int = 10**9,
+        downscale: float = 1,
+        alpha: bool = False,
+        scale: int = 1,
     ) -> dict[str, Path]:
         inputs = {stage: tmp_path / stage for stage in evaluate.INPUTS}
         for folder in inputs.values():
@@ -92,8 +99,9 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
         (inputs["ingest"] / "images").mkdir()
         views = [_view(i, f"{i:03d}.jpg", "test" if i % 3 == 1 and i // 3 < tests else "train") for i in range(15)]
         for view in views:
-            _photo(view, alpha).save(inputs["ingest"] / view.file)
-        camera = Camera("SIMPLE_PINHOLE", WIDTH, HEIGHT, (FOCAL, WIDTH / 2, HEIGHT / 2))
+            _photo(view, alpha, scale).save(inputs["ingest"] / view.file)
+        width, height = scale * WIDTH, scale * HEIGHT
+        camera = Camera("SIMPLE_PINHOLE", width, height, (scale * FOCAL, width / 2, height / 2))
         identity = Similarity(1.0, np.eye(3), np.zeros(3))
         scene = Scene((camera,), tuple(views), identity, False, alpha, "inside", True)
         write_json(inputs["normalise"] / "scene.json", scene.to_json())
@@ -120,7 +128,7 @@ def test_a_perfect_field_is_sharp_and_beats_both_trivial_predictions(make: Make,
     assert 0.99 < metrics["ssim"] <= 1
     assert 5 < metrics["psnr_mean_image"] < 25 and 5 < metrics["psnr_nearest_view"] < 25
     assert metrics["verdict"].startswith("Sharp and trustworthy: 5")
-    assert line.endswith("· 4 photos") and "nearest photo" in line
+    assert line.endswith("· 4 photos at 32 × 24") and "nearest photo" in line
     assert progress.updates[-1] == ("test photo 4 of 4", 1.0)
 
 
@@ -133,7 +141,7 @@ def test_psnr_of_a_constant_error_is_its_closed_form(error: float, make: Make, t
 def test_overall_figures_are_the_means_of_the_photos(make: Make, tmp_path: Path, progress: Any):
     metrics, _ = _run(make(SkyField(0.1)), tmp_path / "out", progress)
     assert [image["name"] for image in metrics["images"]] == ["001.jpg", "004.jpg", "007.jpg", "010.jpg"]
-    for key in set(evaluate.FIGURES) - {"psnr_pose_fitted"}:
+    for key in set(FIGURES) - {"psnr_pose_fitted"}:
         assert metrics[key] == pytest.approx(np.mean([image[key] for image in metrics["images"]]))
     assert metrics["psnr_pose_fitted"] is None and not metrics["poses_fitted"]
     low, high = metrics["psnr_interval"]
@@ -162,14 +170,113 @@ def test_alpha_data_is_scored_over_the_background(
     assert (render == empty).all(axis=-1).any()
 
 
-def test_scores_at_the_size_the_field_was_trained_at(make: Make, tmp_path: Path, progress: Any):
-    inputs = make(downscale=2)
+def test_photos_are_scored_at_their_own_size_whatever_was_trained(make: Make, tmp_path: Path, progress: Any):
+    inputs = make(NoisyField(0.05), downscale=2)
     metrics, line = _run(inputs, tmp_path / "out", progress)
-    assert metrics["width_share"] == 0.5 and line.endswith("· 4 photos at 50% width")
-    assert Image.open(tmp_path / "out" / metrics["images"][0]["render"]).size == (16, 12)
-    assert " dB on unseen photos at 50% of their width, " in metrics["verdict"]
-    full, _ = _run(inputs, tmp_path / "full", progress, downscale=1)
-    assert full["width_share"] == 1 and full["psnr"] > metrics["psnr"]
+    assert line.endswith("· 4 photos at 32 × 24 (trained at 16 × 12)")
+    assert " dB on 4 unseen photos at 32 × 24 (trained at 16 × 12), " in metrics["verdict"]
+    assert (metrics["photo_size"], metrics["scored_size"], metrics["trained_size"]) == ([32, 24], [32, 24], [16, 12])
+    for image in metrics["images"]:
+        render, truth = (
+            torch.from_numpy(np.array(Image.open(file))) / 255
+            for file in (tmp_path / "out" / image["render"], inputs["ingest"] / "images" / Path(image["render"]).name)
+        )
+        direct = -10 * math.log10(float((render - truth).square().mean()))
+        assert image["psnr"] == pytest.approx(direct, abs=0.01), "renders are rounded to 8 bits"
+        assert image["ssim"] == pytest.approx(ssim(render, truth), abs=1e-3)
+    smaller, line = _run(inputs, tmp_path / "smaller", progress, downscale=2)
+    assert smaller["scored_size"] == [16, 12] and line.endswith("· 4 photos at 16 × 12")
+    assert smaller["psnr"] != metrics["psnr"]
+
+
+def test_large_photos_are_scored_at_1600_pixels(make: Make, tmp_path: Path, progress: Any, monkeypatch: Any):
+    monkeypatch.setattr("stages.train.data.MAX_SCORED_SIDE", 60)
+    metrics, line = _run(make(scale=3), tmp_path / "out", progress)
+    assert (metrics["photo_size"], metrics["scored_size"]) == ([96, 72], [60, 45])
+    assert line.endswith("· 4 photos at 60 × 45 (trained at 96 × 72)")
+
+
+class NoisyField(SkyField):
+    """The sky with errors that differ from place to place: a tenth of the directions are off by half of white."""
+
+    def render(self, rays: Rays, background: Tensor) -> Rendering:
+        rendering = super().render(rays, background)
+        waves = torch.sin(40 * rays.directions[:, :1]) * torch.sin(40 * rays.directions[:, 2:])
+        return rendering._replace(colour=rendering.colour + torch.where(waves > 0.8, 0.5, 0.02 * waves))
+
+
+def test_short_time_means_tiles_of_every_photo(make: Make, tmp_path: Path, progress: Any):
+    inputs = make(NoisyField(), scale=10, downscale=2)  # 320 × 240: 300 tiles
+    whole, _ = _run(inputs, tmp_path / "whole", progress, fraction=1)
+    metrics, line = _run(inputs, tmp_path / "tiles", progress, fraction=0.25)
+    assert (metrics["fraction"], metrics["photos_scored"], metrics["photos_test"]) == (0.25, 4, 4)
+    assert " dB on 25% of each of 4 unseen photos at 320 × 240 (trained at 160 × 120), " in metrics["verdict"]
+    assert line.endswith(" · 25% of each of 4 photos at 320 × 240 (trained at 160 × 120)")
+    for image, of_all in zip(metrics["images"], whole["images"], strict=True):
+        assert image["name"] == of_all["name"]
+        assert 0 < abs(image["psnr"] - of_all["psnr"]) < 1.5 and 0 < abs(image["ssim"] - of_all["ssim"]) < 0.05
+        assert abs(image["psnr_nearest_view"] - of_all["psnr_nearest_view"]) < 1
+        assert abs(image["psnr_right_half"] - of_all["psnr_right_half"]) < 2
+    assert metrics["psnr"] == pytest.approx(whole["psnr"], abs=0.6)
+    assert metrics["ssim"] == pytest.approx(whole["ssim"], abs=0.02)
+    low, high = metrics["psnr_interval"]
+    assert low < whole["psnr"] < high
+
+
+def test_pictures_of_photos_scored_in_tiles_are_whole_and_smaller(make: Make, tmp_path: Path, progress: Any):
+    inputs = make(SkyField(0.1), scale=10)
+    metrics, _ = _run(inputs, tmp_path / "tiles", progress, fraction=0.25)
+    assert metrics["psnr"] == pytest.approx(20, abs=0.05)
+    for image in metrics["images"]:
+        render = Image.open(tmp_path / "tiles" / image["render"])
+        truth = Image.open(inputs["ingest"] / "images" / Path(image["render"]).name).resize(
+            render.size, Image.Resampling.BOX
+        )
+        assert render.size == Image.open(tmp_path / "tiles" / image["error"]).size == (80, 60)
+        assert np.abs(np.asarray(render, float) - np.asarray(truth, float) - 25.5).max() < 8
+
+
+def test_tiles_leave_out_what_masks_ignore(make: Make, tmp_path: Path, progress: Any):
+    ignore = np.zeros((240, 320), bool)
+    ignore[:, :250] = True
+    metrics, _ = _run(masked(make(SkyField(0.1), scale=10), ignore), tmp_path / "out", progress, fraction=0.1)
+    assert metrics["psnr"] == pytest.approx(20, abs=0.05), "the error is 0.1 wherever it counts"
+    assert metrics["photos_scored"] == 4 and metrics["ssim"] is not None
+
+
+def test_the_fraction_scored_is_what_there_is_time_for(make: Make, tmp_path: Path, progress: Any):
+    pixels = 4 * 320 * 240
+    inputs = make(scale=10, speed=pixels // 10)  # all take ten seconds
+
+    def fraction(**asked: Any) -> float | None:
+        return evaluate.plan(evaluate.Config(**asked), inputs, progress).fraction
+
+    assert fraction() == pytest.approx(seconds.MIN_RENDERING / 10 / 1.25, abs=0.03)
+    words = f"{pixels / 1e4:.0f} k rays/s here: all pixels of 4 test photos take about 10 s, training took 2 s; "
+    assert progress.notes == [words + "--evaluate.fraction 1 asks for all"]
+    assert fraction(seconds=20.0) == 1 and len(progress.notes) == 1
+    assert 0.08 < fraction(seconds=4.0) < 0.2  # type: ignore[operator]
+    assert 0.03 < fraction(seconds=0.1) < 0.045  # type: ignore[operator] # half a second in any case
+    assert fraction(seconds=0.1, fraction=1.0) == 1, "as asked"
+
+
+@pytest.mark.parametrize(
+    ("affordable", "fraction"), [(1.2, 1), (0.99, 0.79), (0.125, 0.1), (0.0626, 0.05), (1e-4, 8e-5)]
+)
+def test_a_fraction_is_rounded_down(affordable: float, fraction: float):
+    assert planning._rounded_down(affordable, 1.25) == pytest.approx(fraction)
+
+
+def test_plan_answers_every_open_question_once(make: Make, progress: Any):
+    inputs = make(downscale=1.5, speed=1)
+    planned = evaluate.plan(evaluate.Config(), inputs, progress)
+    assert planned.fraction and planned.downscale is None
+    assert evaluate.plan(planned, inputs, progress) == planned
+    assert len(progress.notes) == 1
+
+
+def test_a_scene_without_test_photos_has_nothing_to_plan(make: Make, progress: Any):
+    assert evaluate.plan(evaluate.Config(), make(tests=0), progress).fraction == 1
 
 
 def masked(inputs: dict[str, Path], ignore: np.ndarray) -> dict[str, Path]:
@@ -203,7 +310,7 @@ def test_a_test_photos_exposure_is_no_fault(stops: float, make: Make, tmp_path: 
     assert metrics["psnr_exposure_fitted"] == pytest.approx(noise_alone, abs=0.1)
     assert metrics["psnr"] < noise_alone - 6 and metrics["psnr_right_half"] < noise_alone - 6
     right, fitted = metrics["psnr_right_half"], metrics["psnr_exposure_fitted"]
-    words = f"right halves {right:.1f} dB, {fitted:.1f} dB with its exposure fitted on the left half · nearest photo"
+    words = f"right halves {right:.1f} dB, {fitted:.1f} dB with the exposure fitted on the left half · nearest photo"
     assert words in line and line.startswith(f"{metrics['psnr']:.1f} ± ")
     assert f"{metrics['psnr']:.1f} dB" in metrics["verdict"], "the verdict keeps the raw score"
 
@@ -251,63 +358,20 @@ def test_a_fully_masked_photo_is_not_scored(make: Make, tmp_path: Path, progress
     dot = np.zeros((HEIGHT, WIDTH), np.uint8)
     dot[3, 3] = 255
     write_png(inputs["ingest"] / "masks/004.png.png", dot)
-    metrics, line = _run(inputs, tmp_path / "out", progress)
+    metrics, line = _run(inputs, tmp_path / "out", progress, downscale=2)
     assert [image["name"] for image in metrics["images"]] == ["001.jpg", "007.jpg", "010.jpg"]
     assert progress.notes == ["masks leave nothing to compare of 1 photo at this size"] == metrics["notes"][:1]
-    assert line.endswith("· 3 of 4 photos at 50% width")
+    assert line.endswith("· 3 of 4 photos at 16 × 12")
 
 
 def test_masks_that_leave_nothing_of_any_test_photo_are_named(make: Make, tmp_path: Path, progress: Any):
     metrics, line = _run(masked(make(), np.ones((HEIGHT, WIDTH), bool)), tmp_path / "out", progress)
-    why = "masks leave nothing of the test photos looked at"
+    why = "masks leave nothing of the test photos"
     assert metrics["verdict"] == f"Not measured: {why}." and line == f"nothing measured: {why}"
     assert metrics["notes"][:2] == [
         "masks leave nothing to compare of 4 photos at this size",
         f"{why}, so nothing is measured",
     ]
-
-
-def test_a_slow_field_is_scored_on_fewer_photos(make: Make, tmp_path: Path, progress: Any):
-    metrics, line = _run(make(speed=5 * WIDTH * HEIGHT), tmp_path / "out", progress)
-    words = "3 of 4 test photos are scored, evenly spread"
-    assert progress.notes == [
-        "3.8 k rays/s here: all 4 test photos take about 0.8 s, training took 2 s; --evaluate.photos asks for more",
-        words,
-    ]
-    assert metrics["notes"][0] == words
-    assert (metrics["photos_scored"], metrics["photos_test"], len(metrics["images"])) == (3, 4, 3)
-    assert line.endswith("· 3 of 4 photos")
-
-
-def test_photos_asked_for_are_scored_whatever_they_take(make: Make, tmp_path: Path, progress: Any):
-    inputs = make(speed=1)
-    assert _run(inputs, tmp_path / "two", progress, photos=2)[0]["photos_scored"] == 2
-    assert _run(inputs, tmp_path / "all", progress, photos=99)[0]["photos_scored"] == 4
-
-
-def test_a_photo_too_large_for_the_time_is_scored_smaller(make: Make, progress: Any, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(evaluate, "MIN_SIDE", 4)
-    monkeypatch.setattr("stages.render.renderer.Allowance.left", lambda _: 2.0)
-    inputs = make(speed=WIDTH * HEIGHT // 32)  # a photo takes 32 seconds
-
-    def downscale(**asked: Any) -> float | None:
-        return evaluate.plan(evaluate.Config(seconds=2, **asked), inputs, progress).downscale
-
-    assert downscale() == 4
-    assert "it is scored at 25% of its width; --evaluate.downscale 1 asks for more" in progress.notes[-1]
-    assert downscale(downscale=1) == 1, "as asked"
-    monkeypatch.setattr(evaluate, "MIN_SIDE", WIDTH / 3)
-    assert downscale() == 3, "no smaller than can be judged"
-    monkeypatch.setattr(evaluate, "READING", 30 / 15 + 0.01)
-    assert downscale() == 1, "reading fifteen photos at another size takes as long"
-
-
-def test_plan_answers_every_open_question_once(make: Make, progress: Any):
-    inputs = make(downscale=1.5, speed=1)
-    planned = evaluate.plan(evaluate.Config(), inputs, progress)
-    assert (planned.downscale, planned.photos) == (1.5, 1)
-    assert evaluate.plan(planned, inputs, progress) == planned
-    assert len(progress.notes) == 1
 
 
 def test_two_photos_give_no_interval_and_no_trust(make: Make, tmp_path: Path, progress: Any):
@@ -319,7 +383,7 @@ def test_two_photos_give_no_interval_and_no_trust(make: Make, tmp_path: Path, pr
 
 def test_without_test_photos_nothing_is_measured_and_nothing_fails(make: Make, tmp_path: Path, progress: Any):
     metrics, line = _run(make(tests=0), tmp_path / "out", progress)
-    assert all(metrics[key] is None for key in (*evaluate.FIGURES, "psnr_interval", "ssim_interval"))
+    assert all(metrics[key] is None for key in (*FIGURES, "psnr_interval", "ssim_interval"))
     assert metrics["images"] == [] and metrics["verdict"] == "Not measured: no photo was kept for testing."
     assert metrics["notes"][0] == "no photo was kept for testing, so nothing is measured"
     assert line == "nothing measured: no photo was kept for testing"
@@ -341,30 +405,9 @@ def test_lpips_is_named_as_missing(make: Make, tmp_path: Path, progress: Any):
     assert metrics["notes"][-1].startswith("LPIPS is not computed: ")
 
 
-@given(st.lists(st.integers(1, 100), max_size=12), st.integers(1, 1000))
-def test_affordable_is_the_largest_even_choice_within_the_budget(pixels: list[int], budget: int):
-    chosen = affordable(pixels, budget)
-    assert chosen == sorted(set(chosen)) and all(0 <= i < len(pixels) for i in chosen)
-    if sum(pixels) <= budget:
-        assert chosen == list(range(len(pixels)))
-    assert sum(pixels[i] for i in chosen) <= budget or len(chosen) == 1
-    assert bool(chosen) == bool(pixels)
-    if len(chosen) > 1:
-        gaps = np.diff([-0.5, *chosen, len(pixels) - 0.5])
-        assert gaps[1:-1].max() - gaps[1:-1].min() <= 1
-
-
 def test_poses_need_gradients_of_rays(make: Make, tmp_path: Path, progress: Any) -> None:
     inputs = make()
     with refused("evaluate.no-pose-fit", "sky"):
         _run(inputs, tmp_path / "on", progress, fit_poses="on")
     metrics, _ = _run(inputs, tmp_path / "auto", progress)
     assert metrics["psnr_pose_fitted"] is None and not metrics["poses_fitted"]
-
-
-@pytest.mark.parametrize(("seconds", "count"), [(0.9, 1), (2.9, 2), (5.0, 4), (0.01, 1)])
-def test_seconds_given_bound_the_photos_whatever_training_took(make: Make, progress: Any, seconds: float, count: int):
-    inputs = make(speed=WIDTH * HEIGHT)  # a photo a second; reading fifteen takes 0.75 of them
-    planned = evaluate.plan(evaluate.Config(seconds=seconds), inputs, progress)
-    assert planned.photos == count
-    assert not progress.notes or f", given {seconds:g} s, of which" in progress.notes[0].replace("0 s", "0.01 s")

@@ -15,13 +15,23 @@ from nerf.geometry.rays import Rays
 from stages import evaluate
 from stages.effects.decisions import Decisions
 from stages.effects.image_effects import image_effects, learnt_effects, photo_effects
-from stages.evaluate import Examiner
+from stages.evaluate import scoring
 from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
+from stages.evaluate.summary import RIGHT_HALVES, line_of
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.render.renderer import Renderer
 from stages.train.data import PhotoReader, training_dataset, view_rays
 from tests.stages.photo_scene import photographed
 from tests.synthetic_photos import Quiet
+
+METRICS: dict[str, Any] = {"psnr": 20.5, "psnr_interval": None, "ssim": 0.6, "psnr_nearest_view": 15.0} | {
+    "psnr_mean_image": 12.0,
+    "photos_scored": 2,
+    "photos_test": 2,
+    "fraction": 1,
+    "scored_size": (64, 48),
+    "trained_size": (64, 48),
+}
 
 
 def test_fitted_poses_are_scored_at_the_photos_exposure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,10 +48,11 @@ def test_fitted_poses_are_scored_at_the_photos_exposure(tmp_path: Path, monkeypa
         given.append((model, rendering.colour, others[-1]))
         return rays._replace(near=rays.near + 0.5)  # seen from elsewhere
 
-    monkeypatch.setattr("stages.evaluate.half_images.from_fitted_pose", fit)
+    monkeypatch.setattr(scoring, "from_fitted_pose", fit)
     neutral = Renderer(AppearanceModel(field, (ExposureModel(torch.full((1, 3), 0.3)),)), torch.zeros(3))
-    examiner = Examiner(scene, inputs["ingest"], tmp_path, neutral, info, True, 1.0)
-    (scored,) = examiner.score([view], Quiet())
+    reader = PhotoReader(inputs["ingest"], scene, 1.0)
+    scorer = scoring.Scorer(scene, inputs["ingest"], neutral, info, True, None, 1.0, reader, reader)
+    scored = scoring.score(scorer, tmp_path, Quiet()).images[0]
     rays = view_rays(scene, view, 1.0)
     exposed = neutral.through(photo_effects(info, scene, view))
     assert given[0][0] is field and torch.equal(given[0][1], exposed.draw(rays).colour)
@@ -85,21 +96,22 @@ def test_a_test_pose_is_fitted_in_viewing_distances(monkeypatch: pytest.MonkeyPa
 )
 def test_poses_are_fitted_where_training_refined_them_or_as_asked(asked: Any, refined: bool, fitted: bool) -> None:
     field = {"kind": "grid", "effects": {"pose_refinement": {"a.jpg": [0.0] * 6}} if refined else {}}
-    assert evaluate.fits_poses(evaluate.Config(fit_poses=asked), field) is fitted
+    assert scoring.fits_poses(evaluate.Config(fit_poses=asked), field) is fitted
 
 
 @pytest.mark.parametrize(
     ("scores", "words"),
     [
         ((20.0, 20.3, None), ""),
-        ((20.0, 20.6, None), " · right halves 20.0 dB, 20.6 dB with its exposure fitted on the left half"),
+        ((20.0, 20.6, None), " · right halves 20.0 dB, 20.6 dB with the exposure fitted on the left half"),
         ((20.0, 20.3, 20.4), ""),
         (
             (20.0, 20.3, 24.0),
-            " · right halves 20.0 dB, 20.3 dB with its exposure fitted on the left half, 24.0 dB with its pose, too",
+            " · right halves 20.0 dB, 20.3 dB with the exposure fitted on the left half, 24.0 dB with the pose, too",
         ),
         ((None, None, None), ""),
     ],
 )
 def test_the_line_names_what_was_fitted(scores: tuple[float | None, ...], words: str) -> None:
-    assert evaluate._right_halves(dict(zip(evaluate.RIGHT_HALVES, scores, strict=True))) == words
+    fitted = dict(zip(RIGHT_HALVES, scores, strict=True))
+    assert f"20.5 dB, SSIM 0.60{words} · nearest photo" in line_of(METRICS | fitted)

@@ -43,9 +43,14 @@ def test_scored_and_shown_photos_may_be_some(tmp_path: Path, progress: Any):
     metrics = json.loads(path.read_text("utf-8")) | {"photos_test": 9}
     write_json(path, metrics)
     html, _ = written(inputs, tmp_path / "out", progress)
-    assert "All 6 test photos that are scored" in html and "<p>6 of 9 test photos</p>" in html
+    assert (
+        "All 6 test photos that are scored" in html
+        and "<p>25% of each of 6 of 9 photos at 96 × 72 (trained at 48 × 36)</p>" in html
+    )
     write_json(path, metrics | {"images": metrics["images"][:1], "photos_scored": 1})
-    assert "<p>1 of 9 test photos</p>" in written(inputs, tmp_path / "one", progress)[0]
+    assert (
+        "<p>25% of 1 of 9 photos at 96 × 72 (trained at 48 × 36)</p>" in written(inputs, tmp_path / "one", progress)[0]
+    )
 
 
 def test_files_beside_the_page_are_named(tmp_path: Path, progress: Any):
@@ -69,8 +74,8 @@ def test_long_photo_names_are_broken(inputs: dict[str, Path], tmp_path: Path, pr
         assert f'<table class="names">\n<thead><tr>{head}' in html
 
 
-def test_the_curves_photos_are_those_above(inputs: dict[str, Path], tmp_path: Path, progress: Any):
-    words = "Held-out photos are the test photos above"
+def test_the_curve_names_its_pixels(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    words = "The curve is of 2,048 pixels of all test photos"
     assert words in written(inputs, tmp_path / "out", progress)[0]
     unmeasured = {stage: folder for stage, folder in inputs.items() if stage != "evaluate"}
     assert words not in written(unmeasured, tmp_path / "unmeasured", progress)[0]

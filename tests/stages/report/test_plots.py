@@ -39,7 +39,7 @@ def _curve() -> list[dict[str, Any]]:
             "step": 100 * k,
             "seconds": float(2**k),
             "train_psnr": 10 + 2.0 * k,
-            "heldout_psnr": 9 + 1.5 * k if k % 2 else None,
+            "probe_psnr": 9 + 1.5 * k if k % 2 else None,
         }
         for k in range(1, 8)
     ]
@@ -70,9 +70,9 @@ def test_plots_of_one_page_share_no_identifier():
 def test_the_curve_shows_prediction_and_knee():
     steep = curve_svg(_curve(), {}, coming_doubling("grid", True, _curve())) or ""
     assert "predicted" in steep and "knee" not in steep
-    flat = [row | {"heldout_psnr": 20 - 8 / row["seconds"]} for row in _curve()]
+    flat = [row | {"probe_psnr": 20 - 8 / row["seconds"]} for row in _curve()]
     assert "knee, 16 s" in (curve_svg(flat, {}) or "")
-    unknown = [row | {"heldout_psnr": None} for row in _curve()]
+    unknown = [row | {"probe_psnr": None} for row in _curve()]
     for about in (("grid", True, unknown), ("paper", True, _curve()), ("grid", False, _curve())):
         assert coming_doubling(*about) is None
     assert "predicted" not in (curve_svg(unknown, {}) or "predicted")
@@ -96,7 +96,7 @@ def test_the_prediction_lies_inside_the_plot(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(plots, "svg_element", lambda figure: str(tops.append(figure.axes[0].get_ylim()[1])))
     curve, coming = _curve(), Gain(8.0, 0.5)
     curve_svg(curve, {"nearest photo": 14.2}, coming)
-    assert curve[-1]["heldout_psnr"] + 8.5 <= tops[0] < 40
+    assert curve[-1]["probe_psnr"] + 8.5 <= tops[0] < 40
 
 
 def test_the_cameras_plot_says_up_where_known():

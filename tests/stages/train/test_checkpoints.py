@@ -4,9 +4,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.refusals import no_note, unheard
 from stages.io.files import write_durably
 from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
+from tests.refusals import no_note, unheard
 
 
 def checkpoint(step: int) -> Checkpoint:

@@ -5,11 +5,11 @@ import pytest
 from nerf.training.learning_curve import Gain
 from stages.train.curve import doubling_words, next_words, ssim_words
 
-POINTS = [{"seconds": 10.0 * 2**k, "heldout_psnr": 20.0 + k} for k in range(5)]
+POINTS = [{"seconds": 10.0 * 2**k, "probe_psnr": 20.0 + k} for k in range(5)]
 
 
 def test_doublings_are_of_training_time() -> None:
-    last = "the last doubling of training time, to 2 min 40 s, bought +1.0 dB on held-out photos"
+    last = "the last doubling of training time, to 2 min 40 s, bought +1.0 dB on test pixels"
     assert doubling_words(POINTS, None) == last
     less = "(less over a run of half the time, which would have ended above this curve)"
     again = "as long again at these sizes (--more 160s) is predicted to buy +0.7 dB (± 0.4)"
@@ -24,7 +24,7 @@ def test_in_a_line_it_is_said_of_what() -> None:
 
 
 def test_what_bought_nothing_has_no_minus() -> None:
-    points = [{"seconds": 10.0 * 2**k, "heldout_psnr": 20.0 - 0.01 * k} for k in range(5)]
+    points = [{"seconds": 10.0 * 2**k, "probe_psnr": 20.0 - 0.01 * k} for k in range(5)]
     assert "bought +0.0 dB" in (doubling_words(points, None) or "")
 
 
@@ -33,5 +33,5 @@ def test_what_bought_nothing_has_no_minus() -> None:
     [(0.5, 0.61, "rose from 0.50 to 0.61"), (0.61, 0.5, "fell from 0.61 to 0.50"), (0.846, 0.853, "stayed at 0.85")],
 )
 def test_ssim_rises_falls_or_stays(before: float, after: float, words: str):
-    points = [{"seconds": 10.0 * (k + 1), "heldout_ssim": ssim} for k, ssim in enumerate((before, after))]
+    points = [{"seconds": 10.0 * (k + 1), "probe_ssim": ssim} for k, ssim in enumerate((before, after))]
     assert ssim_words(points) == f"SSIM {words} in that doubling"

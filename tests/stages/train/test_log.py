@@ -7,7 +7,7 @@ import pytest
 from stages.contract import StageError
 from stages.train.state import TrainingLog
 
-POINT = {"step": 3, "seconds": 0.5, "train_psnr": 20.0, "heldout_psnr": None}
+POINT = {"step": 3, "seconds": 0.5, "train_psnr": 20.0, "probe_psnr": None}
 
 
 def test_events_are_appended_line_by_line_over_restarts(tmp_path: Path) -> None:

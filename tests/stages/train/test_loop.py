@@ -15,8 +15,7 @@ from stages.train.checkpoints import latest_checkpoint
 from stages.train.loop import TrainingRun
 from stages.train.state import TrainingBudget
 from stages.train.validation_images import Target
-from tests.refusals import no_note
-from tests.refusals import refused
+from tests.refusals import no_note, refused
 from tests.stages.train.one_number import Killed, OneNumber, events, killed_at, number_of, probe, quiet, run_in, unseen
 
 
@@ -119,11 +118,11 @@ def test_the_curve_ends_with_the_run_and_is_on_record(
     run = run_in(tmp_path, progress)
     run.train()
     assert run.state.curve[-1]["step"] == 40
-    assert run.state.curve[-1]["heldout_psnr"] == 20.0
+    assert run.state.curve[-1]["probe_psnr"] == 20.0
     measured = [e for e in events(tmp_path) if e["event"] == "measured"]
     assert [e["step"] for e in measured] == [point["step"] for point in run.state.curve]
     assert [point["step"] for point in run.state.curve] == [10, 15, 21, 29, 40]
-    assert {"device", "threads"} & set(run.state.curve[0]) == set() and run.state.curve[0]["heldout_ssim"] is None
+    assert {"device", "threads"} & set(run.state.curve[0]) == set() and run.state.curve[0]["probe_ssim"] is None
 
 
 def test_what_was_measured_of_steps_taken_back_is_forgotten(
@@ -157,7 +156,7 @@ def test_the_live_line_tells_step_speed_quality_and_time_left(tmp_path: Path, pr
     run.train()
     message, done = progress.updates[-1]
     assert message.startswith("step 40 · ") and message.endswith(
-        " rays/s · train 20.0 dB · held out 20.0 dB · 0 s left"
+        " rays/s · train 20.0 dB · 20.0 dB on test pixels · 0 s left"
     )
     assert done == pytest.approx(1)
 

@@ -18,6 +18,7 @@ from stages.io.files import read_json
 from stages.io.photos import Photo, write_photos
 from stages.train import Config
 from stages.train.config import GRID_ONLY, PAPER_ONLY
+from stages.train.data import training_dataset
 from stages.train.fields.hash_grid import LEARNING_RATES
 from stages.train.training import prepare
 from stages.train.validation_images import unseen_photos, with_validation
@@ -55,17 +56,17 @@ def test_photos_become_a_field_that_beats_a_flat_colour(tmp_path: Path, progress
     assert result.outputs == OUTPUTS
     assert all((tmp_path / "train" / name).exists() for name in (*result.outputs, *result.records))
     flat = 11.0  # dB, of the best single colour
-    assert flat + 2 < result.facts["heldout_psnr"] < 60
+    assert flat + 2 < result.facts["probe_psnr"] < 60
     _, info = load_field(tmp_path / "train")
     assert (info["steps"], info["rays"], info["downscale"], info["background"]) == (120, 120 * 64, 1.0, [1, 1, 1])
     assert result.facts["steps"] == 120 and result.facts["restarts"] == result.facts["rollbacks"] == 0
-    assert f"held out {result.facts['heldout_psnr']:.1f} dB, over time ▁" in result.line
+    assert f"{result.facts['probe_psnr']:.1f} dB on test pixels, over time ▁" in result.line
     curve = read_json(tmp_path / "train" / "curve.json")
     assert (curve["device"], curve["threads"], curve["downscale"]) == ("cpu", cores(), 1.0)
     last = curve["points"][-1]
     assert [point["step"] for point in curve["points"]] == [64, 91, 120]
-    assert set(last) == {"step", "seconds", "train_psnr", "heldout_psnr", "heldout_ssim"}
-    assert curve["points"][0]["heldout_ssim"] < last["heldout_ssim"] < 1
+    assert set(last) == {"step", "seconds", "train_psnr", "probe_psnr", "probe_ssim"}
+    assert curve["points"][0]["probe_ssim"] < last["probe_ssim"] < 1
     assert progress.notes[0] == "paper field (2 × 16), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels"
 
 
@@ -73,7 +74,7 @@ def test_the_grid_field_trains_from_photos_too(tmp_path: Path, progress) -> None
     inputs, _ = photographed(tmp_path, channels=4)
     result = trained(tmp_path / "train", inputs, progress, field="grid", chunks=2, steps=120)
     flat = 11.0  # dB, of the best single colour
-    assert flat + 2 < result.facts["heldout_psnr"] < 60
+    assert flat + 2 < result.facts["probe_psnr"] < 60
     _, info = load_field(tmp_path / "train")
     assert (info["kind"], info["background"], result.facts["field"]) == ("grid", [1, 1, 1], "grid")
     assert (info["settings"]["num_levels"], info["settings"]["max_res"]) == (2, 32)
@@ -138,7 +139,7 @@ def test_a_grid_field_that_diverges_is_rolled_back(tmp_path: Path, progress, mon
     assert result.facts["rollbacks"] == 1
     assert "nonfinite_30.safetensors" in result.records
     assert any("the loss of step 30 is not finite: back to step" in note for note in progress.notes)
-    assert 13 < result.facts["heldout_psnr"] < 60
+    assert 13 < result.facts["probe_psnr"] < 60
 
 
 def test_an_empty_hash_grid_field_is_given_up(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,19 +170,27 @@ def test_without_test_photos_nothing_is_held_out(tmp_path: Path, progress) -> No
     scene_file = inputs["normalise"] / "scene.json"
     scene_file.write_text(scene_file.read_text().replace('"test"', '"train"'))
     result = trained(tmp_path / "train", inputs, progress, steps=2)
-    assert result.facts["heldout_psnr"] is None
-    assert "no photos held out" in result.line
+    assert result.facts["probe_psnr"] is None
+    assert "no test photos" in result.line
+
+
+def test_probes_are_at_the_size_that_photos_are_scored_at(tmp_path: Path, progress) -> None:
+    inputs, scene = photographed(tmp_path)
+    dataset = training_dataset(inputs["ingest"], scene, "test", 2.0, progress)
+    unseen = unseen_photos(Config(downscale=2.0), inputs["ingest"], scene, "test", "cpu", progress)
+    assert unseen
+    ball_and_white = {(30, 60, 200), (255, 255, 255)}
+    assert {*map(tuple, (unseen.probe.colours * 255).round().int().tolist())} == ball_and_white
+    assert not {*map(tuple, dataset.pixels[:, :3].tolist())} <= ball_and_white, "at the trained size edges are mixed"
 
 
 def test_test_photos_of_which_masks_leave_nothing_stop_no_training(tmp_path: Path, progress) -> None:
     """Validation photos, by which a run is to end, do."""
-    dot = np.zeros((HEIGHT, WIDTH), np.uint8)
-    dot[4, 4] = 255
-    inputs, masked = photographed(tmp_path, mask=dot)
+    inputs, masked = photographed(tmp_path, mask=np.zeros((HEIGHT, WIDTH), np.uint8))
     config = Config(downscale=2.0)
     assert unseen_photos(config, inputs["ingest"], masked, "test", "cpu", progress) is None
     why = "the masks ignore every pixel of the test photos at this size"
-    assert progress.notes == [f"held-out quality is not measured while training: {why}"]
+    assert progress.notes == [f"test photos are not measured while training: {why}"]
     with refused("train.all-masked"):
         unseen_photos(config, inputs["ingest"], with_validation(masked), "validation", "cpu", progress)
 
@@ -303,8 +312,8 @@ def test_every_seed_is_measured_on_the_same_pixels(tmp_path: Path, progress) -> 
         (folder := tmp_path / f"train{seed}").mkdir()
         config = train.plan(Config(**TINY, steps=1, seed=seed, target_psnr=20.0), inputs, progress)
         probes = prepare(config, scene, inputs, folder, progress).probes
-        assert probes.heldout and probes.target
-        unseen = (probes.heldout, probes.target.photos)
+        assert probes.test and probes.target
+        unseen = (probes.test, probes.target.photos)
         others = (probe for each in unseen for probe in (each.probe, each.patches.probe))
         found.append([probe.colours for probe in (probes.train, *others)])
     assert len(found[0]) == 5 and all(torch.equal(*pair) for pair in zip(*found, strict=True))

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from tests.refusals import codes
 from stages.contract import StageError
 from stages.sfm.imported.pose_files import ImportedPoses, read_poses
+from tests.refusals import codes
 from tests.stages.sfm.imported.test_pose_files import LENS, NAMES, PHOTOS, frame
 
 

@@ -12,7 +12,6 @@ from PIL import Image
 
 from nerf.geometry.scene import Camera
 from stages import ingest, normalise, sfm
-from tests.refusals import codes
 from stages.ingest.decoding import upright
 from stages.io.colmap_files import PARAMETERS
 from stages.io.photos import Photo, read_photos
@@ -23,7 +22,7 @@ from stages.sfm.colmap.models import read_model, write_model
 from stages.sfm.imported.orientation import QUARTER_TURNS, pixel_map, turned_camera, turned_pose
 from stages.sfm.imported.pose_files import ImportedPoses, read_poses
 from tests.camera_layouts import ring
-from tests.refusals import refused
+from tests.refusals import codes, refused
 from tests.stages.ingest.photo_files import exif_with
 
 WIDTH, HEIGHT = 60, 40

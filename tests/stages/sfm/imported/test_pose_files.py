@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerf.geometry.scene import Camera
-from tests.refusals import codes
 from stages.contract import StageError
 from stages.io.photos import Photo
 from stages.io.sparse_model import SparseImage, SparseModel
@@ -17,7 +16,7 @@ from stages.io.transforms_export import intrinsics
 from stages.sfm.colmap.models import write_model
 from stages.sfm.imported.conventions import PoseConvention
 from stages.sfm.imported.pose_files import ImportedPoses, _by_name, read_poses
-from tests.refusals import refused
+from tests.refusals import codes, refused
 
 W, H = 60, 40
 
