@@ -23,11 +23,11 @@ from nerf.effects import HeldOutImages
 from nerf.fields.hash_grid import HashGridField
 from nerf.geometry.scene import Scene
 from nerf.training import hash_grid_trainer
+from nerf.training.evaluation_pixels import EvaluationPixels, evaluate, sample_evaluation_pixels
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.schedule import schedule_of
+from nerf.training.schedule import new_schedule
 from nerf.training.trainer import FieldTrainer
-from nerf.training.validation_probe import Probe, make_probe, measure
 from stages.effects.decisions import Decisions, read_decisions
 from stages.effects.image_effects import held_out_images, image_effects
 from stages.hardware.backend import chosen_backend, load_backend
@@ -35,13 +35,14 @@ from stages.hardware.device import compute_device
 from stages.io.files import read_json, read_scene
 from stages.train import Config
 from stages.train.data import field_background, guided_dataset, training_dataset
-from stages.train.fields import field_of, make_trainer, with_defaults
+from stages.train.fields.field_list import field_of, make_trainer, with_defaults
+from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.planning import chosen_downscale
 
 BUDGETS = (125, 250, 500, 1000, 2000)
 ONCE = 1000  # steps that draw every pixel of the training photos once: it is their number that gives the photos' size
-CHUNKS = 2
-PROBE_RAYS = 2048
+MICRO_BATCHES = 2
+EVALUATION_PIXELS = 2048
 PER_DOUBLING = 2  # measurements
 FIRST = 32  # steps
 MEAN_EVERY = 8  # steps
@@ -66,7 +67,7 @@ class Bench(NamedTuple):
     scene: Scene
     decisions: Decisions
     dataset: RayDataset
-    probe: Probe
+    pixels: EvaluationPixels
     held_out: HeldOutImages
 
 
@@ -77,11 +78,9 @@ def bench_of(workspace: Path) -> Bench:
     scene, decisions = read_scene(inputs["normalise"]), read_decisions(inputs["effects"])
     config = with_defaults(
         Config(
-            field="grid",
             contracted="background" in decisions.on,
             view_dependence="view_dependence" in decisions.on,
-            backend=chosen_backend(compute_device(), Quiet()),
-            chunks=CHUNKS,
+            grid=HashGridOptions(backend=chosen_backend(compute_device(), Quiet()), micro_batches=MICRO_BATCHES),
         )
     )
     rays = ONCE * field_of(config).rays_per_step(config)
@@ -91,9 +90,9 @@ def bench_of(workspace: Path) -> Bench:
     train = guided_dataset(inputs, scene, downscale, Quiet())
     test = training_dataset(inputs["ingest"], scene, "test", downscale, Quiet())
     shown_over = torch.tensor(field_background(config, scene))
-    probe = make_probe(test, PROBE_RAYS, shown_over, seed=0)
+    pixels = sample_evaluation_pixels(test, EVALUATION_PIXELS, shown_over, seed=0)
     return Bench(
-        config, scene, decisions, train, probe, held_out_images(scene.of_split("train"), scene.of_split("test"))
+        config, scene, decisions, train, pixels, held_out_images(scene.of_split("train"), scene.of_split("test"))
     )
 
 
@@ -122,11 +121,11 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
     assert isinstance(trainer, HashGridTrainer)
     means = {name: RunningMean(trainer, exponent) for name, exponent in MEANS.items()}
     due = {round(steps / 2 ** (k / PER_DOUBLING)) for k in range(PER_DOUBLING * int(math.log2(steps / FIRST)) + 1)}
-    plan = schedule_of(steps) if schedule == "whole" else schedule_of(steps // 2).extended(steps)
-    points, pace, rays = [], 0.0, 0
+    plan = new_schedule(steps) if schedule == "whole" else new_schedule(steps // 2).extended_to(steps)
+    points, speed, rays = [], 0.0, 0
     for step in range(steps):
         result = trainer.step(step, plan.progress(step))
-        pace += (result.psnr - pace) * max(1 / (step + 1), 0.02)
+        speed += (result.psnr - speed) * max(1 / (step + 1), 0.02)
         rays += result.rays
         if (step + 1) % MEAN_EVERY == 0:
             for mean in means.values():
@@ -134,8 +133,8 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
         if step + 1 in due:
             as_expected = trainer.effects.of_held_out(bench.held_out)
             models = {"probe_psnr": trainer.model} | {name: mean.model for name, mean in means.items()}
-            psnr = {name: measure(model, bench.probe, as_expected).psnr for name, model in models.items()}
-            points.append({"step": step + 1, "train_psnr": pace, **psnr})
+            psnr = {name: evaluate(model, bench.pixels, as_expected).psnr for name, model in models.items()}
+            points.append({"step": step + 1, "train_psnr": speed, **psnr})
     return {"rays": rays, "pixels": bench.dataset.unmasked_count, "points": points}
 
 
@@ -159,7 +158,7 @@ def main() -> None:
             if any(run.items() <= made.items() for made in runs):
                 continue
             bench = bench or bench_of(workspace)
-            load_backend(bench.config.backend or "warp", compute_device(), Quiet())
+            load_backend(bench.config.grid.backend or "warp", compute_device(), Quiet())
             clock = time.process_time()
             run |= train_run(bench, seed, steps, given.schedule)
             last = run["points"][-1]

@@ -25,7 +25,7 @@ from nerf.training.trainer import FieldTrainer
 from stages.effects.decisions import Decisions
 from stages.effects.image_effects import image_effects
 from stages.train import Config
-from stages.train.fields import make_trainer
+from stages.train.fields.field_list import make_trainer
 
 WARM_STEPS = 300
 SHARE = 0.1  # of the run: the learning rate is still whole

@@ -75,7 +75,7 @@ def frame_seconds(workspace: Path, width: int) -> tuple[float, str]:
     seconds = []
     for _ in range(2):
         started = time.perf_counter()
-        renderer.draw(rays)
+        renderer.render(rays)
         seconds.append(time.perf_counter() - started)
     return min(seconds), "×".join(map(str, reversed(rays.near.shape)))
 
@@ -90,8 +90,8 @@ def figures(workspace: Path, case: Case, memory_gb: float) -> dict[str, Any]:
         "set": case.name,
         "downscale": case.downscale,
         "seconds": case.seconds,
-        "grids": f"{field['levels']} × 2^{field['log2_rows']} to {field['finest']}",
-        **{name: facts[name] for name in ("steps", "rays_per_second", "samples_per_second")},
+        "grids": f"{field['num_levels']} × 2^{field['log2_hashmap_size']} to {field['max_res']}",
+        **{name: facts[name] for name in ("steps", "rays_per_second", "colours_per_second")},
         "psnr": metrics["psnr"],
         "ssim": metrics["ssim"],
         "frame_seconds": frame,

@@ -27,7 +27,16 @@ from stages.io.files import write_json
 from stages.io.transforms_export import intrinsics, opengl_matrix
 
 LENS, PHOTOS = Camera("PINHOLE", 120, 90, (125.0, 125.0, 60.0, 45.0)), 100
-SIZES = ("--train.steps", "1000", "--train.levels", "5", "--train.log2-rows", "18", "--train.finest", "512")
+SIZES = (
+    "--train.steps",
+    "1000",
+    "--train.grid.num-levels",
+    "5",
+    "--train.grid.log2-hashmap-size",
+    "18",
+    "--train.grid.max-res",
+    "512",
+)
 UNTIL_FIRST_STEP = """
 import os, time
 from pipeline.cli.commands import main
@@ -38,7 +47,7 @@ def first(take, *_):
     print("first step done at", time.time(), flush=True)
     os._exit(0)
 
-training_loop.observed = first
+training_loop.profiled_step = first
 main()
 """
 

@@ -94,12 +94,12 @@ def train(run: dict[str, Any], model: HashGridField, data: tuple[RayDataset, Ray
         HashGridTrainerSettings(
             seed=run["seed"],
             background=BLACK,
-            samples=given.samples,
-            chunks=1 if given.device == "cuda" else workers(),
-            rate=run["learning_rate"],
-            distortion=run["distortion"] if model.space.unbounded else 0.0,
-            depth_loss=DEPTH_LOSS,
-            least_photos=MIN_PHOTOS,
+            target_samples=given.samples,
+            micro_batches=1 if given.device == "cuda" else workers(),
+            learning_rate=run["learning_rate"],
+            distortion_weight=run["distortion"] if model.space.unbounded else 0.0,
+            depth_weight=DEPTH_LOSS,
+            min_photos=MIN_PHOTOS,
         ),
     )
     marks = {round(share * given.steps) for share in RECORDED}
@@ -108,7 +108,8 @@ def train(run: dict[str, Any], model: HashGridField, data: tuple[RayDataset, Ray
     errors: list[float] = []
     for step in range(given.steps):
         result = trainer.step(step, step / given.steps)
-        rays, colours, densities = rays + result.rays, colours + result.samples, densities + result.densities
+        rays, colours = rays + result.rays, colours + result.colour_evaluations
+        densities += result.density_evaluations
         errors = [*errors[-49:], result.psnr]
         if step + 1 in marks:
             seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu

@@ -23,7 +23,7 @@ from nerf.runtime.parallel import take_over_cores, workers
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from nerf.training.metrics import mean_squared_error, psnr
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
-from nerf.training.trainer import over
+from nerf.training.trainer import composite_over
 
 SCENE_PER_BLENDER = 0.75  # takes the objects of the NeRF-synthetic set into [-0.9, 0.9]^3
 WHITE = torch.ones(3)
@@ -64,7 +64,7 @@ def heldout(model: HashGridField, dataset: RayDataset) -> tuple[float, list[torc
         side = math.isqrt(len(pixels))
         rays, colour, alpha, _ = dataset.lookup(pixels)
         square = Rays(*(part.reshape(side, side, *part.shape[1:]) for part in rays))
-        truth = over(colour, alpha, WHITE).view(side, side, 3)
+        truth = composite_over(colour, alpha, WHITE).view(side, side, 3)
         picture = render_image(model, square, WHITE).colour
         values.append(psnr(mean_squared_error(picture, truth)))
         first = first or [picture, truth]
@@ -76,9 +76,9 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--downscale", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=60)
-    parser.add_argument("--levels", type=int, default=5)
-    parser.add_argument("--log2-rows", type=int, default=18)
-    parser.add_argument("--finest", type=int, default=384)
+    parser.add_argument("--num-levels", type=int, default=5)
+    parser.add_argument("--log2-hashmap-size", type=int, default=18)
+    parser.add_argument("--max-res", type=int, default=384)
     parser.add_argument("--steps", type=int, default=384)
     parser.add_argument("--samples", type=int, default=1 << 14)
     parser.add_argument("--backend", choices=("warp", "torch"), default="warp")
@@ -91,12 +91,14 @@ def main() -> None:
     record = Record(given.out)
     print(f"{torch.get_num_threads()} threads")
     take_over_cores()
-    settings = HashGridSettings(given.levels, 4, given.log2_rows, 16, given.finest, diagonal_steps=given.steps)
+    settings = HashGridSettings(
+        given.num_levels, 4, given.log2_hashmap_size, 16, given.max_res, diagonal_steps=given.steps
+    )
     train = read_dataset(given.folder, "train", given.downscale, 1)
     test = read_dataset(given.folder, "test", given.downscale, given.test_every)
     model = HashGridField(settings, given.seed, fast if given.backend == "warp" else reference)
     trainer = HashGridTrainer(
-        model, train, HashGridTrainerSettings(given.seed, "random", given.samples, chunks=workers())
+        model, train, HashGridTrainerSettings(given.seed, "random", given.samples, micro_batches=workers())
     )
     print(f"{settings}\n{model.layout.rows:,} rows")
     clock = time.process_time if given.processor_time else time.perf_counter

@@ -28,8 +28,8 @@ from stages.hardware.device import compute_device, cores
 from stages.io.files import read_scene
 from stages.train import Config, plan
 from stages.train.data import guided_dataset
-from stages.train.fields import field_of, make_trainer
-from stages.train.profile import FIRST_TIMED, RATES_SECONDS, observed, parts_table
+from stages.train.fields.field_list import field_of, make_trainer
+from stages.train.profile import FIRST_PROFILED_STEP, RATES_SECONDS, profile_table, profiled_step
 
 LINKED = {"ingest": "photos.json", "normalise": "scene.json", "effects": "effects.json"}
 WARM_STEPS, TIMED_STEPS = 300, 60
@@ -56,19 +56,19 @@ def main() -> None:
         for step in range(WARM_STEPS):
             trainer.step(step, SHARE, 1.0)
         for step in range(WARM_STEPS, WARM_STEPS + TIMED_STEPS):
-            observed(partial(trainer.step, step, SHARE, 1.0), FIRST_TIMED, timings, device)
+            profiled_step(partial(trainer.step, step, SHARE, 1.0), FIRST_PROFILED_STEP, timings, device)
         field = field_of(config)
         rates = measure_rates(device, field.matmul_width(config), field.table_rows(config), RATES_SECONDS)
-        table = parts_table(timings, rates)
+        table = profile_table(timings, rates)
     report(table)
     Record(given.out).add(
         set=given.photos.name,
         downscale=config.downscale,
         seconds=given.seconds,
-        colours_per_step=config.batch_samples,
+        colours_per_step=config.grid.target_samples,
         step_ms=round(1e3 * table["seconds"] / TIMED_STEPS, 1),
-        at_machine_rates_percent=round(100 * table["floor_share"]),
-        **{f"{row['part']}_percent": round(100 * row["share"]) for row in table["parts"]},
+        at_machine_rates_percent=round(100 * table["efficiency"]),
+        **{f"{row['span']}_percent": round(100 * row["share"]) for row in table["spans"]},
     )
 
 
@@ -86,8 +86,12 @@ def loaded(workspace: Path, asked: Config) -> tuple[Config, Scene, RayDataset, D
     inputs = {stage: stage_folder(workspace, output) for stage, output in LINKED.items()}
     scene, config = read_scene(inputs["normalise"]), plan(asked, inputs, Spoken())
     assert config.downscale, "plan() chooses it"
-    sizes = f"{config.levels} grids of 2^{config.log2_rows} rows to {config.finest}³, photos at 1/{config.downscale:g}"
-    of_step = f"{config.batch_samples:,} colours in a step of {config.chunks} parts, {cores()} cores at work"
+    grid = config.grid
+    sizes = f"{grid.num_levels} grids of 2^{grid.log2_hashmap_size} rows to {grid.max_res}³"
+    sizes += f", photos at 1/{config.downscale:g}"
+    of_step = (
+        f"{grid.target_samples:,} colours in a step of {grid.micro_batches} micro-batches, {cores()} cores at work"
+    )
     print(f"{sizes}, {of_step}", flush=True)
     dataset = guided_dataset(inputs, scene, config.downscale, Spoken()).to(compute_device())
     return config, scene, dataset, read_decisions(inputs["effects"])
@@ -95,13 +99,16 @@ def loaded(workspace: Path, asked: Config) -> tuple[Config, Scene, RayDataset, D
 
 def report(table: dict[str, Any]) -> None:
     """Print the table."""
-    speeds = "  ".join(f"{table[name] / table['seconds']:,.0f} {name}/s" for name in ("rays", "samples", "densities"))
+    speeds = "  ".join(
+        f"{table[name] / table['seconds']:,.0f} {name}/s"
+        for name in ("rays", "colour_evaluations", "density_evaluations")
+    )
     print(f"{speeds}  {1e3 * table['seconds'] / TIMED_STEPS:.1f} ms a step, of {cores()} cores:")
-    for row in table["parts"]:
-        least = f"{1e3 * row['floor'] / TIMED_STEPS:6.2f} ms at the machine's rates" if row["floor"] else ""
-        print(f"  {row['part']:10s} {1e3 * row['seconds'] / TIMED_STEPS:6.2f} ms {100 * row['share']:5.1f} %  {least}")
-    print(f"{100 * table['floor_share']:.0f} % of the computed time at the machine's rates")
-    print(f"at most {table['most_rays_per_second']:,.0f} rays/s")
+    for row in table["spans"]:
+        least = f"{1e3 * row['min_seconds'] / TIMED_STEPS:6.2f} ms at the machine's rates" if row["min_seconds"] else ""
+        print(f"  {row['span']:10s} {1e3 * row['seconds'] / TIMED_STEPS:6.2f} ms {100 * row['share']:5.1f} %  {least}")
+    print(f"{100 * table['efficiency']:.0f} % of the computed time at the machine's rates")
+    print(f"at most {table['max_rays_per_second']:,.0f} rays/s")
 
 
 if __name__ == "__main__":

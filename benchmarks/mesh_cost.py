@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from benchmarks.record import Record, add_out
-from nerf import REGION_HALF
+from nerf import REGION_HALF_SIZE
 from nerf.geometry.scene import Scene
 from pipeline.demo.truth import Truth, compare_with_truth
 from pipeline.engine.workspace import Workspace
@@ -55,9 +55,9 @@ def to_truth(mesh: "ColouredMesh", scene: "Scene", normalise: Path, truth: Truth
 
 def to_points(mesh: "ColouredMesh", points: np.ndarray) -> dict[str, float]:
     """From the sparse points in the region to the mesh: median, and nine in ten, in percent of the region's size."""
-    inside = points[np.abs(points).max(1) < REGION_HALF]
+    inside = points[np.abs(points).max(1) < REGION_HALF_SIZE]
     distance = KDTree(sample_surface(mesh.vertices, mesh.faces, SAMPLES, seed=0)).query(inside)[0]
-    median, most = np.percentile(distance, [50, 90]) * 100 / (2 * REGION_HALF)
+    median, most = np.percentile(distance, [50, 90]) * 100 / (2 * REGION_HALF_SIZE)
     return {"point_to_mesh_percent": median, "nine_in_ten_percent": most}
 
 

@@ -82,7 +82,7 @@ def score_ours(workspace: Path) -> float:
     for view in scene.of_split("test"):
         truth = reader.pixels(view, WHITE)
         shown = renderer.through(photo_effects(info, scene, view, renderer.device))
-        picture = shown.draw(view_rays(scene, view, info["downscale"])).colour.clamp(0, 1)
+        picture = shown.render(view_rays(scene, view, info["downscale"])).colour.clamp(0, 1)
         values.append(psnr(mean_squared_error(picture, truth)))
     return sum(values) / len(values)
 

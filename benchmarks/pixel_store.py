@@ -38,7 +38,8 @@ from stages.hardware.memory import available_bytes
 from stages.io import pixel_store
 from stages.train import Config
 from stages.train.data import training_dataset
-from stages.train.fields import field_of, make_trainer, with_defaults
+from stages.train.fields.field_list import field_of, make_trainer, with_defaults
+from stages.train.fields.hash_grid_options import HashGridOptions
 
 WIDTH, HEIGHT = 4000, 3000
 DIFFERENT = 4  # photos that are painted; the others are copies
@@ -97,20 +98,23 @@ def draw(dataset: RayDataset, where: str, record: Record, repeats: int = REPEATS
     order = PixelSampler(dataset.unmasked_count, 0, dataset.device)
     for count in BATCHES:
         places = itertools.count(step=count)
-        taken = milliseconds(lambda n=count, p=places: dataset.lookup(dataset.nth(order.take(next(p), n))), repeats)
+        taken = milliseconds(
+            lambda n=count, p=places: dataset.lookup(dataset.unmasked_pixels(order.take(next(p), n))), repeats
+        )
         record.add(what=f"{count} rays, {where}", **taken, **memory())
 
 
 def train(ingest: Path, scene: Scene, downscale: float) -> dict[str, Any]:
     """The time of a step of training on a store that has been made, and the memory of the process that took it."""
     device = compute_device()
-    asked = Config(field="grid", contracted=True, view_dependence=True, downscale=downscale)
-    config = with_defaults(asked.model_copy(update={"backend": chosen_backend(device, Spoken())}))
+    grid = HashGridOptions(backend=chosen_backend(device, Spoken()))
+    config = with_defaults(Config(grid=grid, contracted=True, view_dependence=True, downscale=downscale))
     config = field_of(config).with_sizes(config, scene, rays=math.inf)
     dataset = training_dataset(ingest, scene, "train", downscale, Spoken()).to(device)
     trainer, step = make_trainer(config, scene, dataset, config.seed), itertools.count()
     taken = milliseconds(lambda: trainer.step(next(step), 0.0, 1.0), STEPS)
-    sizes = f"{config.levels} grids of 2^{config.log2_rows} rows, {config.batch_samples:,} colours in a step"
+    grid = config.grid
+    sizes = f"{grid.num_levels} grids of 2^{grid.log2_hashmap_size} rows, {grid.target_samples:,} colours in a step"
     return {"what": f"a step of training: {sizes}", **taken, **memory()}
 
 

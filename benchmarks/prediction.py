@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.record import Record, add_out
 from nerf.training.hash_grid_trainer import LR_HOLD_FRACTION
-from nerf.training.learning_curve import MIN_STEPS, Curve, last_doubling
+from nerf.training.learning_curve import MIN_STEPS, Curve, last_doubling_gain
 
 SHARE = 0.8  # of the truths that an interval is to hold
 LEAST = 0.1  # dB: by as much two seeds differ
@@ -74,7 +74,7 @@ def cases_of(runs: list[Run]) -> list[Case]:
             continue
         if (short["set"], short["seed"], 2 * short["steps"]) != (long["set"], long["seed"], long["steps"]):
             continue
-        last = last_doubling(curve_of(short))
+        last = last_doubling_gain(curve_of(short))
         assert last is not None, "runs are measured for more than a doubling"
         gap = short["points"][-1]["train_psnr"] - final(short)
         name = f"{short['set']} seed {short['seed']} {short['steps']} steps"

@@ -70,7 +70,7 @@ def measured(renderer: Renderer, folders: dict[str, Path], downscale: float, pho
         rays = view_rays(scene, view, downscale)
         truth = reader.pixels(view, renderer.background.tolist())
         started = time.perf_counter()
-        picture = shown.draw(rays).colour.clamp(0, 1)
+        picture = shown.render(rays).colour.clamp(0, 1)
         seconds.append(time.perf_counter() - started)
         scores.append(psnr(mean_squared_error(picture, truth)))
     return sum(seconds) / len(seconds), sum(scores) / len(scores)

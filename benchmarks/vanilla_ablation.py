@@ -26,8 +26,8 @@ from stages.io.files import read_json
 VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
     "complete": {},
     "no view dependence": {"force": {"view_dependence": "off"}},
-    "no positional encoding": {"train": {"positional_encoding": False}},
-    "no hierarchical sampling": {"train": {"hierarchical": False}},
+    "no positional encoding": {"vanilla": {"positional_encoding": False}},
+    "no hierarchical sampling": {"vanilla": {"hierarchical": False}},
 }
 AS_PUBLISHED = {"exposure": "off", "view_dependence": "on", "pose_refinement": "off"}
 STAGES = ("ingest", "sfm", "normalise", "effects", "train", "evaluate")
@@ -35,9 +35,10 @@ STAGES = ("ingest", "sfm", "normalise", "effects", "train", "evaluate")
 
 def settings_of(photos: Path, variant: str, seed: int, steps: int, downscale: float) -> Settings:
     """The reduced vanilla NeRF (4 layers of 64, 32 + 32 samples) in one variant."""
-    train = {"field": "paper", "steps": steps, "seed": seed, "downscale": downscale}
     chosen = VARIANTS[variant]
-    values = {"train": train | chosen.get("train", {}), "effects": {"force": AS_PUBLISHED | chosen.get("force", {})}}
+    train = {"steps": steps, "seed": seed, "downscale": downscale}
+    train |= {"field": "vanilla", "vanilla": chosen.get("vanilla", {})}
+    values = {"train": train, "effects": {"force": AS_PUBLISHED | chosen.get("force", {})}}
     return with_source(settings_from(values, "the benchmark"), photos, None)
 
 

@@ -1,4 +1,4 @@
-"""How fast the paper's field is, where its time goes, and how near it comes to its matrix products alone.
+"""How fast the vanilla NeRF is, where its time goes, and how near it comes to its matrix products alone.
 
     python -m benchmarks.vanilla_field [--preset small|published] [--threads N]
 

@@ -17,5 +17,7 @@ Conventions (docs/CONVENTIONS.md has the reasons):
   ``from __future__ import annotations``.
 """
 
-REGION_HALF = 0.9  # half the side of the region of interest, [-0.9, 0.9]^3 of the scene frame
-FULL = 252  # of 255: from here on a photo's value may have been cut off, and tells no more than that it was bright
+REGION_HALF_SIZE = 0.9  # half the side of the region of interest, [-0.9, 0.9]^3 of the scene frame
+MIN_SATURATED = (
+    252  # of 255: from here on a photo's value may have been cut off, and tells no more than that it was bright
+)

@@ -32,23 +32,49 @@ Importing a stage must be cheap: torch, pycolmap, kornia and their like are impo
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, NamedTuple, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol, Self
 
 from pydantic import BaseModel, ConfigDict
+from pydantic.fields import FieldInfo
 from tyro.conf import Suppress
 
 MAX_LETTERS = 600  # of each part of an error
 KEY_LENGTH = 16  # hex digits of a key that name a stage's folder: 64 bits
 
 
-class StageConfig(BaseModel):
-    """Settings of one stage. Unknown keys, infinities and NaN are refused. A ``Path`` enters keys by content."""
+class Options(BaseModel):
+    """Settings that stand together. Unknown keys, infinities and NaN are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def filled(self, values: Mapping[str, Any]) -> Self:
+        """These options with ``values`` where they are None; for nested options, a mapping of theirs."""
+        update: dict[str, Any] = {}
+        for name, value in values.items():
+            given = getattr(self, name)
+            if isinstance(given, Options):
+                update[name] = given.filled(value)
+            elif given is None:
+                update[name] = value
+        return self.model_copy(update=update)
+
+    @classmethod
+    def flags(cls) -> Iterator[tuple[str, FieldInfo]]:
+        """Every option that has a flag, nested ones by their dotted names."""
+        for name, option in cls.model_fields.items():
+            kind = option.annotation
+            if isinstance(kind, type) and issubclass(kind, Options):
+                yield from ((f"{name}.{inner}", nested) for inner, nested in kind.flags())
+            elif Suppress not in option.metadata:
+                yield name, option
+
+
+class StageConfig(Options):
+    """Settings of one stage. A ``Path`` enters keys by content."""
 
     @property
     def time_is_open(self) -> bool:

@@ -12,5 +12,5 @@ def skip_without(device: str) -> None:
     """Skip the test, with the reason, where torch or Warp cannot use ``device``."""
     if device == "cuda" and not torch.cuda.is_available():
         pytest.skip("torch finds no GPU")
-    if why := warp.why_not(device):
+    if why := warp.unavailable_reason(device):
         pytest.skip(why)

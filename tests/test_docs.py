@@ -6,8 +6,6 @@ from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 
-from tyro.conf import Suppress
-
 from benchmarks import results
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from pipeline.engine.stage_list import STAGES
@@ -23,7 +21,7 @@ GENERATED = {ROOT / "docs" / "NUMERICS.md", ROOT / "docs" / "results.md"}
 MAX_PROSE = 128
 MAX_RESULTS = 250
 LINK = re.compile(r"\]\(([^)\s]+)\)")
-OPTION = re.compile(rf"--({'|'.join(STAGES)})\.([a-z][a-z0-9_-]*)")
+OPTION = re.compile(rf"--({'|'.join(STAGES)})\.([a-z][a-z0-9_-]*(?:\.[a-z][a-z0-9_-]*)?)")
 CALL = re.compile(r"(?m)^(?:\w+ = )?run\((\w+), \1\.Config\(.*?\)(?:, \[(.*)\])?\)$")
 CODE = re.compile(r"(?ms)^```(\w*)$\n(.*?)^```$\n")
 TEST = re.compile(r"`(tests/[\w/]+\.py)::(\w+)`")
@@ -37,15 +35,13 @@ def name_of(path: Path) -> str:
 
 def options_of(stage: str) -> set[str]:
     """The dotted flags of a stage, without those that the command line fills in itself."""
-    fields = STAGES[stage].Config.model_fields
-    return {name.replace("_", "-") for name, field in fields.items() if Suppress not in field.metadata}
+    return {name.replace("_", "-") for name, _ in STAGES[stage].Config.flags()}
 
 
 def flags_of(stage: str) -> set[str]:
     """:func:`options_of`, and how switches are turned off."""
-    fields = STAGES[stage].Config.model_fields
-    switches = {name.replace("_", "-") for name, field in fields.items() if field.annotation is bool}
-    return options_of(stage) | {f"no-{switch}" for switch in switches}
+    switches = [name.replace("_", "-") for name, option in STAGES[stage].Config.flags() if option.annotation is bool]
+    return options_of(stage) | {re.sub(r"([\w-]+)$", r"no-\1", switch) for switch in switches}
 
 
 def documented(text: str) -> set[tuple[str, str]]:
@@ -84,13 +80,13 @@ def dead_links(page: Path) -> Iterator[str]:
 
 def unlike_the_code(stage: str, page: str) -> Iterator[str]:
     """Options whose default in the table is not the code's. One that is chosen (None) is described in words."""
-    for name, field in STAGES[stage].Config.model_fields.items():
-        if isinstance(field.default, bool) or not isinstance(field.default, int | float):
+    for name, option in STAGES[stage].Config.flags():
+        if isinstance(option.default, bool) or not isinstance(option.default, int | float):
             continue
-        option = f"--{stage}.{name.replace('_', '-')}"
-        row = re.search(rf"(?m)^\| `{option}` \| ([^|]+) \|", page)
-        if not row or float(row[1]) != field.default:
-            yield option
+        flag = f"--{stage}.{name.replace('_', '-')}"
+        row = re.search(rf"(?m)^\| `{flag}` \| ([^|]+) \|", page)
+        if not row or float(row[1]) != option.default:
+            yield flag
 
 
 def page_of(stage: str) -> str:
@@ -183,7 +179,8 @@ def test_the_checks_can_fail(tmp_path: Path):
     assert documented("`--train.steps 500` and --mesh.max-faces") == {("train", "steps"), ("mesh", "max-faces")}
     assert "photos" not in options_of("ingest") and "cameras" not in options_of("sfm")
     assert "cameras" in options_of("render") and "no-depth" in flags_of("render")
-    assert "steppes" not in flags_of("train")
+    assert "steppes" not in flags_of("train") and "vanilla.no-hierarchical" in flags_of("train")
+    assert documented("`--train.grid.max-res 9`, --train.seconds.") == {("train", "grid.max-res"), ("train", "seconds")}
     assert list(unlike_the_code("train", page_of("train").replace("| 0 |", "| 1 |"))) == ["--train.seed"]
     nowhere = tmp_path / "page.md"
     nowhere.write_text("# Here\n[a](b.md) [b](#here) [c](#there) [d](https://example.org)\n", "utf-8")

@@ -57,7 +57,15 @@ SFM_AND_INGEST: dict[str, str] = {
 TRAINING: dict[str, str] = {
     r"\b(load_)?[Pp]ainter\b": "Renderer",
     r"\bpsnr_(right|fitted_right|posed_right)\b": "psnr_right_half, psnr_exposure_fitted, psnr_pose_fitted",
-    r"\bparts\.json\b": "profile.json",
+    r"\bparts\.json\b|\b(floor_share|most_rays_per_second|steps_timed)\b": "profile.json, efficiency, profiled steps",
+    r"validation_probe|\b(make_probe|make_patches|ProbeResult|PROBE_RAYS|unseen_photos)\b": "evaluation pixels",
+    r"\bsymptom|\bis_suspicious\b|\bunripe\b|\b(field is|stays) dead\b": "failure reason, undertrained, collapsed",
+    r"\b(CLOSING_SHARE|schedule_of\(steps|is_whole\b.*revision)|\bplan\.json\b": "step schedule, schedule.json",
+    r"\brate_(start|end)\b|\bleast_photos\b": "learning rate, min_photos",
+    r"\b(REGION_HALF|ALIGNED_ROWS|first_rows|of_directions)\b": "REGION_HALF_SIZE, ROW_ALIGNMENT, level_offsets",
+    r"\b(KNEE|KNEE_DB)\b|predicted to buy|\bthe knee\b": "diminishing returns, gain",
+    r"\b(observed|parts_table|write_parts)\(take": "profiled step",
+    r"training cannot go on|going on from step": "cannot continue, resuming",
 }
 
 MESH_AND_TRADEOFF: dict[str, str] = {

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf import FULL
+from nerf import MIN_SATURATED
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 
@@ -205,12 +205,12 @@ class ImageEffects(NamedTuple):
         """By how much the images would show more than their ``target`` colours; their squares are the loss.
 
         E(C - (1 - o) b) + (1 - o) b less the target, of opacity o, background b and all colour effects E; 0 where the
-        image is FULL and would be: an image ends at 1, and does not tell by how much it was exceeded."""
+        image is MIN_SATURATED and would be: an image ends at 1, and does not tell by how much it was exceeded."""
         if not self.colours:
             return seen.rendering.colour - target
         behind = (1 - seen.rendering.opacity)[:, None] * seen.background
         shown = self._stages(seen, self.colours)[-1] + behind
-        return torch.where((shown > 1) & (target >= FULL / 255), 0.0, shown - target)
+        return torch.where((shown > 1) & (target >= MIN_SATURATED / 255), 0.0, shown - target)
 
     def backward_residual(
         self, seen: RenderedRays, grad: Float[Tensor, "rays 3"]

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from nerf.effects import HeldOutImages, Images
 from nerf.geometry.rays import Rays
-from nerf.rendering.srgb import KNEE, OFFSET, POWER, SLOPE, linear_to_srgb, srgb_to_linear
+from nerf.rendering.srgb import LINEAR_THRESHOLD, OFFSET, POWER, SLOPE, linear_to_srgb, srgb_to_linear
 
 LEARNING_RATE = 2e-3  # of the logarithm of a gain; gains begin within a percent or two of where they end
 MAX_LOG_GAIN = 16.0  # either way: 23 stops, beyond what any camera spans
@@ -117,14 +117,16 @@ def expose_backward(
     done = _branches(colour, log_gain)
     by_gain = _slope(done, _shown(done))
     from_power = by_gain * POWER / (done.colour + OFFSET)  # by_gain · d log s⁻¹(c) / dc
-    from_line = torch.where(done.bright, by_gain / done.colour.clamp(min=KNEE / 1e9), done.gain)  # never divides by 0
+    from_line = torch.where(
+        done.bright, by_gain / done.colour.clamp(min=LINEAR_THRESHOLD / 1e9), done.gain
+    )  # never divides by 0
     by_colour = torch.where(done.was_bright, from_power, from_line) * (colour >= 0)
     by_gain = by_gain * (log_gain.abs() <= MAX_LOG_GAIN)
     return grad * by_colour, (grad * by_gain).sum_to_size(log_gain.shape)
 
 
 class _Branches(NamedTuple):
-    """Colours with their gains, and on which side of the knee they were and come to be."""
+    """Colours with their gains, and on which side of the sRGB curve's threshold they were and come to be."""
 
     colour: Tensor
     log_gain: Tensor
@@ -140,8 +142,8 @@ def _branches(colour: Tensor, log_gain: Tensor) -> _Branches:
     gain = log_gain.exp()
     powered = colour + torch.expm1(log_gain / POWER) * (colour + OFFSET)
     straight = colour * gain
-    was_bright = colour > KNEE
-    bright = torch.where(was_bright, powered, straight) > KNEE
+    was_bright = colour > LINEAR_THRESHOLD
+    bright = torch.where(was_bright, powered, straight) > LINEAR_THRESHOLD
     return _Branches(colour, log_gain, gain, powered, straight, was_bright, bright)
 
 

@@ -34,7 +34,7 @@ def compute_frustum_mask(dataset: RayDataset, space: SpaceMap, least: int, cells
     something: those whose middles ``least`` photos of ``dataset`` look at, or one, from where its foreground begins;
     and a coarse cell around them. What hides them, and masks, count for nothing. Found once for a dataset; not to be
     written to."""
-    answers = _answers.setdefault(dataset.geometry, {})
+    answers = _answers.setdefault(dataset.view_geometry, {})
     if (space, least, cells) not in answers:
         answers[space, least, cells] = _compute_frustum_mask(dataset, space, least, cells)
     return answers[space, least, cells]
@@ -71,7 +71,7 @@ def _looked_at(
     dataset: RayDataset, points: Float[Tensor, "3 points"], view: int
 ) -> tuple[Bool[Tensor, "points"], Bool[Tensor, "points"]]:
     """Which points a photo may show between near and far, and which of these are no nearer than its foreground."""
-    geometry = dataset.geometry[:, view]
+    geometry = dataset.view_geometry[:, view]
     from_scene, centre, near, far = geometry[:9].view(3, 3).T, geometry[9:12, None], geometry[12], geometry[13]
     field = _angles(from_scene @ _spread_directions(dataset, view).T)
     local = from_scene @ (points - centre)
@@ -90,7 +90,7 @@ def _angles(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "2 n"]:
 def _spread_directions(dataset: RayDataset, view: int) -> Float[Tensor, "rays 3"]:
     """Of EDGE_PIXELS² rays of a photo, those of its corners among them."""
     first, end = dataset.first_pixel[view : view + 2].tolist()
-    width = int(dataset.layout[1, view])
+    width = int(dataset.view_layout[1, view])
     share = torch.linspace(0, 1, EDGE_PIXELS, dtype=torch.float64, device=dataset.device)
     row, column = (((n - 1) * share).round().long() for n in ((end - first) // width, width))
     return dataset.rays((first + width * row[:, None] + column).flatten())[0].directions

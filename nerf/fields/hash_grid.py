@@ -123,17 +123,17 @@ class HashGridSettings:
 
 
 class HashGridPass(NamedTuple):
-    """What a rendering computed on its way, for :meth:`HashGridField.backward`; ``marched`` counts all densities asked,
-    ``thickness`` is of the samples' own intervals, not of what they stand for. ``samples`` stand at distances along
-    the ``mapped`` rays, for lengths in the scene."""
+    """What a rendering computed on its way, for :meth:`HashGridField.backward`. ``density_evaluations``: how many
+    points the density was evaluated at. ``optical_thickness`` is that of the samples' own intervals, before thinning.
+    ``samples`` stand at distances along the ``mapped`` rays, for lengths in the scene."""
 
     rays: Rays
     mapped: MappedRays
     background: Float[Tensor, "rays 3"]
-    marched: int
+    density_evaluations: int
     samples: Samples
     points: Float[Tensor, "samples 3"]
-    thickness: Float[Tensor, "samples"]
+    optical_thickness: Float[Tensor, "samples"]
     density: DensityPass
     harmonics: Float[Tensor, "rays direction"]
     colour: ColourPass
@@ -175,12 +175,12 @@ class HashGridField(nn.Module):
         random = generator("cpu", seed, 0)
         shape = (self.layout.rows, settings.features_per_level)
         self.register_buffer("table", (2 * torch.rand(shape, generator=random) - 1) * INITIAL_FEATURE)
-        self.of_directions, self.of_directions_backward = (
+        self.encode_directions, self.encode_directions_backward = (
             (backend.spherical_harmonics, backend.spherical_harmonics_backward)
             if settings.view_dependence
             else (mlp.no_directions, mlp.no_directions_backward)
         )
-        direction = mlp.DIRECTION if settings.view_dependence else 0
+        direction = mlp.DIRECTION_FEATURES if settings.view_dependence else 0
         for name, weight in mlp.initial_weights(self.layout.width, direction, random)._asdict().items():
             self.register_buffer(name, weight)
         if settings.background_model:
@@ -210,7 +210,7 @@ class HashGridField(nn.Module):
 
     def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Density per scene unit; zero in cells that are not sampled, and outside the cube."""
-        unit, sampled = self._located(points)
+        unit, sampled = self._to_unit(points)
         sigma = unit.new_zeros(len(unit))
         sigma[sampled] = self.unit_density(unit[sampled])
         return sigma.view(points.shape[:-1])
@@ -223,14 +223,14 @@ class HashGridField(nn.Module):
         self, points: Float[Tensor, "*points 3"], directions: Float[Tensor, "*points 3"]
     ) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points 3"]]:
         """What :meth:`density` says, and the colour seen by viewing rays of unit ``directions``."""
-        unit, sampled = self._located(points)
+        unit, sampled = self._to_unit(points)
         density = self._density_pass(unit.clamp(0, 1))
-        of_rays = mlp.ray_hidden(self.weights, self.of_directions(directions.reshape(-1, 3).contiguous()))
+        ray_hidden = mlp.direction_hidden(self.weights, self.encode_directions(directions.reshape(-1, 3).contiguous()))
         each = torch.arange(len(unit), dtype=torch.int32, device=unit.device)  # a ray of its own for every point
-        colour = mlp.colour_of(self.weights, each, density.geometry, of_rays)
+        colour = mlp.colour_of(self.weights, each, density.geometry_features, ray_hidden)
         return torch.where(sampled, density.sigma, 0).view(points.shape[:-1]), colour.view(points.shape)
 
-    def _located(self, points: Float[Tensor, "*points 3"]) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
+    def _to_unit(self, points: Float[Tensor, "*points 3"]) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
         """Unit coordinates of points, and which of them lie in cells that are sampled."""
         mapped, half = self.space.forward(points).reshape(-1, 3), self.space.half
         unit = (mapped + half) / (2 * half)
@@ -248,98 +248,102 @@ class HashGridField(nn.Module):
         rays, backend = rays.each(Tensor.contiguous), self.backend
         rendered, accumulated = rays.far.new_zeros(len(rays.far), 4), torch.zeros_like(rays.far)
         depth = torch.zeros_like(rays.far, dtype=torch.float64)
-        of_rays = mlp.ray_hidden(self.weights, self.of_directions(rays.directions))
+        ray_hidden = mlp.direction_hidden(self.weights, self.encode_directions(rays.directions))
         mapped = self.space.map_rays(rays)
         for samples, _, density in self._march(mapped, torch.full_like(rays.near, 0.5), self.render_stepping):
             with span("composite"):
                 samples = _in_scene(mapped, samples)
                 selected = backend.select_colour_samples(samples, density.sigma, OPACITY_STEP, depth, accumulated)
-                geometry = density.geometry.index_select(0, selected.rows)
-            colour = mlp.colour_of(self.weights, selected.samples.ray, geometry, of_rays)
+                geometry_features = density.geometry_features.index_select(0, selected.rows)
+            colour = mlp.colour_of(self.weights, selected.samples.ray, geometry_features, ray_hidden)
             with span("composite"):
                 backend.accumulate_colours(selected, colour, rendered)
         transmittance, opacity = (each.to(rendered.dtype) for each in (torch.exp(-depth), -torch.expm1(-depth)))
         rendered *= torch.where(accumulated == 0, 1, opacity / accumulated)[:, None]
-        colour = rendered[:, :3] + transmittance[:, None] * self._behind(rays, background)
+        colour = rendered[:, :3] + transmittance[:, None] * self._background_of(rays, background)
         return Rendering(colour, rendered[:, 3] + transmittance * rays.far, opacity)
 
     def forward(
         self,
         rays: Rays,
         jitter: Float[Tensor, "rays"],
-        offset: Float[Tensor, "rays"],
+        thinning_offset: Float[Tensor, "rays"],
         background: Float[Tensor, "rays 3"],
     ) -> HashGridPass:
-        """Density of all samples in occupied cells; colour of those that can be seen, thin ones standing for others
-        like them (``Backend.visible_samples``, which ``offset`` is for)."""
+        """Density of all samples in occupied cells; colour of the visible ones, thinned by ``thinning_offset``
+        (``Backend.visible_samples``)."""
         backend, rays = self.backend, rays.each(Tensor.contiguous)
-        background, mapped = self._behind(rays, background), self.space.map_rays(rays)
+        background, mapped = self._background_of(rays, background), self.space.map_rays(rays)
         rounds = list(self._march(mapped, jitter, self.stepping))
         with span("march"):
             marched, order = backend.pack_rounds([each.samples for each in rounds])
             sigma = torch.cat([each.density.sigma for each in rounds]).index_select(0, order)
             samples, seen = backend.visible_samples(
-                marched, sigma, EARLY_STOP_TRANSMITTANCE, THINNING_THRESHOLD, offset
+                marched, sigma, EARLY_STOP_TRANSMITTANCE, THINNING_THRESHOLD, thinning_offset
             )
             rows = order.index_select(0, seen)
             points = torch.cat([each.points for each in rounds]).index_select(0, rows)
             of_rounds = zip(*(each.density for each in rounds), strict=True)
             density = DensityPass(*(torch.cat(parts).index_select(0, rows) for parts in of_rounds))
-            thickness = density.sigma * marched.dt.index_select(0, seen)
+            optical_thickness = density.sigma * marched.dt.index_select(0, seen)
         with span("encode"):
-            harmonics = self.of_directions(rays.directions)
-            of_rays = mlp.ray_hidden(self.weights, harmonics)
-        colour = mlp.colour_forward(self.weights, backend, samples, density.geometry, of_rays)
+            harmonics = self.encode_directions(rays.directions)
+            ray_hidden = mlp.direction_hidden(self.weights, harmonics)
+        colour = mlp.colour_forward(self.weights, backend, samples, density.geometry_features, ray_hidden)
         with span("composite"):
             of_scene = _in_scene(mapped, samples)
             rendering, weights = backend.composite(of_scene, density.sigma, colour.colour, background, rays.far)
-        of_samples = samples, points, thickness, density
+        of_samples = samples, points, optical_thickness, density
         return HashGridPass(rays, mapped, background, len(order), *of_samples, harmonics, colour, rendering, weights)
 
     def backward(
-        self, done: HashGridPass, grad: Rendering, grad_weights: Float[Tensor, "samples"]
+        self, forward_pass: HashGridPass, grad: Rendering, grad_weights: Float[Tensor, "samples"]
     ) -> HashGridGradients:
         """Gradients of a loss, given those of the rendering and of the samples' weights."""
-        backend, density, colour = self.backend, done.density, done.colour
+        backend, density, colour = self.backend, forward_pass.density, forward_pass.colour
         grad_sigma, grad_colour = backend.composite_backward(
-            _in_scene(done.mapped, done.samples),
+            _in_scene(forward_pass.mapped, forward_pass.samples),
             density.sigma,
             colour.colour,
-            done.background,
-            done.rays.far,
+            forward_pass.background,
+            forward_pass.rays.far,
             grad,
             grad_weights,
         )
-        of_colour = mlp.colour_backward(self.weights, backend, done.samples, colour, done.harmonics, grad_colour)
-        of_density = mlp.density_backward(self.weights, backend, density, grad_sigma, of_colour.geometry)
+        of_colour = mlp.colour_backward(
+            self.weights, backend, forward_pass.samples, colour, forward_pass.harmonics, grad_colour
+        )
+        of_density = mlp.density_backward(self.weights, backend, density, grad_sigma, of_colour.geometry_features)
         weights = Weights(of_density.density_hidden, of_density.density_out, *of_colour[:2])
-        of_background = (1 - done.rendering.opacity)[:, None] * grad.colour
+        of_background = (1 - forward_pass.rendering.opacity)[:, None] * grad.colour
         return HashGridGradients(weights, of_density.features, of_colour.harmonics, of_background)
 
     def rays_backward(
-        self, done: HashGridPass, gradients: HashGridGradients
+        self, forward_pass: HashGridPass, gradients: HashGridGradients
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
         """Gradients of the rays' origins and directions, for refining poses."""
-        backend, rays, samples = self.backend, done.rays, _in_scene(done.mapped, done.samples)
-        grad_points = backend.encode_backward_points(self.layout, self.table, done.points, gradients.features)
+        backend, rays, samples = self.backend, forward_pass.rays, _in_scene(forward_pass.mapped, forward_pass.samples)
+        grad_points = backend.encode_backward_points(self.layout, self.table, forward_pass.points, gradients.features)
         if isinstance(self.space, Ndc):
             points = rays.origins[samples.ray] + samples.t[:, None] * rays.directions[samples.ray]
             grad_points = self.space.pull_back(points, grad_points)
         grad_origins, grad_directions = backend.sample_points_backward(
             rays, samples, self.space.bends_rays, grad_points
         )
-        grad_directions = grad_directions + self.of_directions_backward(rays.directions, gradients.harmonics)
+        grad_directions = grad_directions + self.encode_directions_backward(rays.directions, gradients.harmonics)
         if self.settings.background_model:
             grad_directions += directions_backward(
-                backend, self.background_table, rays.directions, done.background, gradients.background
+                backend, self.background_table, rays.directions, forward_pass.background, gradients.background
             )
         return grad_origins, grad_directions
 
-    def background_backward(self, done: HashGridPass, gradients: HashGridGradients) -> Float[Tensor, "rows 4"]:
+    def background_backward(self, forward_pass: HashGridPass, gradients: HashGridGradients) -> Float[Tensor, "rows 4"]:
         """Gradient of the background table, for a field that has one."""
-        return background_backward(self.backend, done.rays.directions, done.background, gradients.background)
+        return background_backward(
+            self.backend, forward_pass.rays.directions, forward_pass.background, gradients.background
+        )
 
-    def _behind(self, rays: Rays, background: Float[Tensor, "*#rays 3"]) -> Float[Tensor, "*#rays 3"]:
+    def _background_of(self, rays: Rays, background: Float[Tensor, "*#rays 3"]) -> Float[Tensor, "*#rays 3"]:
         return (
             background_colour(self.backend, self.background_table, rays.directions)
             if self.settings.background_model

@@ -16,8 +16,10 @@ from nerf.kernels import Backend, Samples
 from nerf.runtime.profiler import WorkCounts, span
 
 HIDDEN = 64
-GEOMETRY = 16  # numbers that the density network hands to the colour network; the first is the logarithm of density
-DIRECTION = 16  # spherical harmonics, where colour depends on the direction
+GEOMETRY_FEATURES = (
+    16  # numbers that the density network hands to the colour network; the first is the logarithm of density
+)
+DIRECTION_FEATURES = 16  # spherical harmonics, where colour depends on the direction
 MAX_LOG_DENSITY = 15.0
 # Samples whose hidden layer of the density network exists at a time: as many as stay in a core's cache
 # (docs/experiments/step_time.md); on a GPU all.
@@ -28,8 +30,8 @@ class Weights(NamedTuple):
     """Of features -> hidden -> geometry, and geometry and direction -> hidden -> colour. Also holds gradients."""
 
     density_hidden: Float[Tensor, "features hidden"]
-    density_out: Float[Tensor, "geometry hidden"]
-    colour_hidden: Float[Tensor, "geometry_and_direction hidden"]
+    density_out: Float[Tensor, "geometry_features hidden"]
+    colour_hidden: Float[Tensor, "geometry_features_and_direction hidden"]
     colour_out: Float[Tensor, "3 hidden"]
 
 
@@ -38,14 +40,14 @@ class DensityPass(NamedTuple):
     it again takes less time than to fetch it from memory."""
 
     features: Float[Tensor, "samples features"]
-    geometry: Float[Tensor, "samples geometry"]
+    geometry_features: Float[Tensor, "samples geometry_features"]
     sigma: Float[Tensor, "samples"]
 
 
 class ColourPass(NamedTuple):
-    """What the colour network made of the samples' ``geometry`` and their rays, layer by layer."""
+    """What the colour network made of the samples' ``geometry_features`` and their rays, layer by layer."""
 
-    geometry: Float[Tensor, "samples geometry"]
+    geometry_features: Float[Tensor, "samples geometry_features"]
     hidden: Float[Tensor, "samples hidden"]
     colour: Float[Tensor, "samples 3"]
 
@@ -54,23 +56,23 @@ class DensityGradients(NamedTuple):
     """Of the density network's weights and features."""
 
     density_hidden: Float[Tensor, "features hidden"]
-    density_out: Float[Tensor, "geometry hidden"]
+    density_out: Float[Tensor, "geometry_features hidden"]
     features: Float[Tensor, "samples features"]
 
 
 class ColourGradients(NamedTuple):
     """Of the colour network's weights and inputs."""
 
-    colour_hidden: Float[Tensor, "geometry_and_direction hidden"]
+    colour_hidden: Float[Tensor, "geometry_features_and_direction hidden"]
     colour_out: Float[Tensor, "3 hidden"]
-    geometry: Float[Tensor, "samples geometry"]
+    geometry_features: Float[Tensor, "samples geometry_features"]
     harmonics: Float[Tensor, "rays direction"]
 
 
 def initial_weights(features: int, direction: int, random: torch.Generator) -> Weights:
-    """Glorot-uniform weights (Glorot and Bengio 2010, eq. 16); ``direction``: DIRECTION, or 0 for colours that are the
-    same from everywhere."""
-    return Weights(*(_glorot(rows, random) for rows in (features, GEOMETRY, GEOMETRY + direction, 3)))
+    """Glorot-uniform weights (Glorot and Bengio 2010, eq. 16); ``direction``: DIRECTION_FEATURES, or 0 for colours that
+    are the same from everywhere."""
+    return Weights(*(_glorot(rows, random) for rows in (features, GEOMETRY_FEATURES, GEOMETRY_FEATURES + direction, 3)))
 
 
 def no_directions(directions: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 0"]:
@@ -94,16 +96,16 @@ def density_flops(weights: Weights) -> int:
 def colour_flops(weights: Weights) -> int:
     """Multiplications and additions of a sample's colour, without what its ray shares; twice as many on the
     way back."""
-    return 2 * (GEOMETRY * HIDDEN + weights.colour_out.numel())
+    return 2 * (GEOMETRY_FEATURES * HIDDEN + weights.colour_out.numel())
 
 
 def density_forward(weights: Weights, features: Float[Tensor, "samples features"]) -> DensityPass:
     """Features to geometry and density."""
     with span("mlp", WorkCounts(matmul_flops=density_flops(weights) * len(features))):
-        geometry = features.new_empty(len(features), GEOMETRY)
+        geometry_features = features.new_empty(len(features), GEOMETRY_FEATURES)
         for rows in _blocks(features):
-            torch.mm(_density_hidden(weights, features[rows]), weights.density_out.T, out=geometry[rows])
-        return DensityPass(features, geometry, sigma_of(geometry))
+            torch.mm(_density_hidden(weights, features[rows]), weights.density_out.T, out=geometry_features[rows])
+        return DensityPass(features, geometry_features, sigma_of(geometry_features))
 
 
 def _density_hidden(weights: Weights, features: Float[Tensor, "samples features"]) -> Float[Tensor, "samples hidden"]:
@@ -116,42 +118,44 @@ def _blocks(samples: Float[Tensor, "samples _"]) -> Iterator[slice]:
     return (slice(first, first + size) for first in range(0, len(samples), size))
 
 
-def sigma_of(geometry: Float[Tensor, "samples geometry"]) -> Float[Tensor, "samples"]:
+def sigma_of(geometry_features: Float[Tensor, "samples geometry_features"]) -> Float[Tensor, "samples"]:
     """exp(min(x, 15)) of the first output. At the limit an interval as short as 0.001 stops all light but e^-3000, so
     that what the limit takes from the gradient is zero already."""
-    return geometry[:, 0].clamp(max=MAX_LOG_DENSITY).exp()
+    return geometry_features[:, 0].clamp(max=MAX_LOG_DENSITY).exp()
 
 
-def ray_hidden(weights: Weights, harmonics: Float[Tensor, "rays direction"]) -> Float[Tensor, "rays hidden"]:
+def direction_hidden(weights: Weights, harmonics: Float[Tensor, "rays direction"]) -> Float[Tensor, "rays hidden"]:
     """What a ray's viewing direction adds to the colour network's hidden layer, for all of its samples."""
-    return harmonics @ weights.colour_hidden[GEOMETRY:]
+    return harmonics @ weights.colour_hidden[GEOMETRY_FEATURES:]
 
 
 def colour_forward(
     weights: Weights,
     backend: Backend,
     samples: Samples,
-    geometry: Float[Tensor, "samples geometry"],
-    of_rays: Float[Tensor, "rays hidden"],
+    geometry_features: Float[Tensor, "samples geometry_features"],
+    ray_hidden: Float[Tensor, "rays hidden"],
 ) -> ColourPass:
-    """Geometry and viewing direction (:func:`ray_hidden`) to colour, through a sigmoid."""
-    with span("mlp", WorkCounts(matmul_flops=colour_flops(weights) * len(geometry))):
-        hidden = geometry @ weights.colour_hidden[:GEOMETRY]
-        backend.add_ray_relu(samples, hidden, of_rays)
-        return ColourPass(geometry, hidden, (hidden @ weights.colour_out.T).sigmoid_())
+    """Geometry and viewing direction (:func:`direction_hidden`) to colour, through a sigmoid."""
+    with span("mlp", WorkCounts(matmul_flops=colour_flops(weights) * len(geometry_features))):
+        hidden = geometry_features @ weights.colour_hidden[:GEOMETRY_FEATURES]
+        backend.add_ray_relu(samples, hidden, ray_hidden)
+        return ColourPass(geometry_features, hidden, (hidden @ weights.colour_out.T).sigmoid_())
 
 
 def colour_of(
     weights: Weights,
     ray: Int32[Tensor, "samples"],
-    geometry: Float[Tensor, "samples geometry"],
-    of_rays: Float[Tensor, "rays hidden"],
+    geometry_features: Float[Tensor, "samples geometry_features"],
+    ray_hidden: Float[Tensor, "rays hidden"],
 ) -> Float[Tensor, "samples 3"]:
     """What :func:`colour_forward` says, for samples of rays ``ray``, where no way back is needed: nothing is kept."""
-    with span("mlp", WorkCounts(matmul_flops=colour_flops(weights) * len(geometry))):
-        logits = geometry.new_empty(len(geometry), 3)
-        for rows in _blocks(geometry):
-            hidden = of_rays.index_select(0, ray[rows]).addmm_(geometry[rows], weights.colour_hidden[:GEOMETRY])
+    with span("mlp", WorkCounts(matmul_flops=colour_flops(weights) * len(geometry_features))):
+        logits = geometry_features.new_empty(len(geometry_features), 3)
+        for rows in _blocks(geometry_features):
+            hidden = ray_hidden.index_select(0, ray[rows]).addmm_(
+                geometry_features[rows], weights.colour_hidden[:GEOMETRY_FEATURES]
+            )
             torch.mm(hidden.relu_(), weights.colour_out.T, out=logits[rows])
         return logits.sigmoid_()
 
@@ -168,10 +172,13 @@ def colour_backward(
     grad_logits = grad_colour * done.colour * (1 - done.colour)
     grad_hidden = grad_logits @ weights.colour_out
     grad_of_ray = backend.add_ray_relu_backward(samples, done.hidden, grad_hidden)
-    of_hidden = torch.cat([done.geometry.T @ grad_hidden, harmonics.T @ grad_of_ray])
-    grad_geometry = grad_hidden @ weights.colour_hidden[:GEOMETRY].T
+    of_hidden = torch.cat([done.geometry_features.T @ grad_hidden, harmonics.T @ grad_of_ray])
+    grad_geometry_features = grad_hidden @ weights.colour_hidden[:GEOMETRY_FEATURES].T
     return ColourGradients(
-        of_hidden, grad_logits.T @ done.hidden, grad_geometry, grad_of_ray @ weights.colour_hidden[GEOMETRY:].T
+        of_hidden,
+        grad_logits.T @ done.hidden,
+        grad_geometry_features,
+        grad_of_ray @ weights.colour_hidden[GEOMETRY_FEATURES:].T,
     )
 
 
@@ -180,16 +187,16 @@ def density_backward(
     backend: Backend,
     done: DensityPass,
     grad_sigma: Float[Tensor, "samples"],
-    grad_geometry: Float[Tensor, "samples geometry"],
+    grad_geometry_features: Float[Tensor, "samples geometry_features"],
 ) -> DensityGradients:
     """Gradients of the network's weights and of the features, given those of the density and of the geometry as the
     colour network saw it, to which the former's is added in place."""
-    within = done.geometry[:, 0] <= MAX_LOG_DENSITY
-    grad_geometry[:, 0] += torch.where(within, grad_sigma * done.sigma, 0)
+    within = done.geometry_features[:, 0] <= MAX_LOG_DENSITY
+    grad_geometry_features[:, 0] += torch.where(within, grad_sigma * done.sigma, 0)
     of_hidden, of_out = torch.zeros_like(weights.density_hidden), torch.zeros_like(weights.density_out)
     grad_features = torch.empty_like(done.features)
     for rows in _blocks(done.features):
-        features, grad_out = done.features[rows], grad_geometry[rows]
+        features, grad_out = done.features[rows], grad_geometry_features[rows]
         hidden, grad_hidden = _density_hidden(weights, features), grad_out @ weights.density_out
         backend.relu_backward(hidden, grad_hidden)
         of_hidden += features.T @ grad_hidden

@@ -3,13 +3,13 @@
 import numpy as np
 from jaxtyping import Float
 
-from nerf import REGION_HALF
+from nerf import REGION_HALF_SIZE
 from nerf.geometry.reconstruction import Reconstruction
 
 MIN_POINTS_IN_VIEW = 10  # fewer say nothing about a photo's depth range; all photos together then do
 NEAR_MARGIN = 0.7  # bare surfaces carry no points: the nearest thing may be nearer than the nearest point
 SURE_VIEWS = 3  # photos that see a point which is no false match
-MIN_NEAR = 0.05 * REGION_HALF  # for cameras in the region whose depths nobody knows
+MIN_NEAR = 0.05 * REGION_HALF_SIZE  # for cameras in the region whose depths nobody knows
 BEYOND = 2.0  # a camera far from the region sees at least as far behind it as it is in front of it
 MAX_FAR, MIN_FAR = 1000.0, 20.0  # contraction maps these to 0.001 and 0.05 from the end of the world
 
@@ -34,8 +34,8 @@ def near_and_far(scene: Reconstruction, bounded: bool) -> tuple[Float[np.ndarray
 
 def _distances_to_region(centres: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Distances of the nearest point of the region (0 inside it) and of its farthest corner."""
-    nearest = np.linalg.norm(np.maximum(np.abs(centres) - REGION_HALF, 0.0), axis=1)
-    return nearest, np.linalg.norm(np.abs(centres) + REGION_HALF, axis=1)
+    nearest = np.linalg.norm(np.maximum(np.abs(centres) - REGION_HALF_SIZE, 0.0), axis=1)
+    return nearest, np.linalg.norm(np.abs(centres) + REGION_HALF_SIZE, axis=1)
 
 
 def _points_range(scene: Reconstruction) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nerf import REGION_HALF
+from nerf import REGION_HALF_SIZE
 from nerf.geometry.near_far import near_and_far
 from nerf.geometry.reconstruction import Reconstruction, spatial_median
 from nerf.geometry.region_of_interest import (
@@ -72,7 +72,7 @@ def normalise(
     region = given or find_region(upright, capture_type)
     if not region.half >= MIN_HALF_SIZE:
         raise ValueError(f"it is {region.half:.2g} units large, and {MIN_HALF_SIZE:g} is the least")
-    scale = REGION_HALF / region.half
+    scale = REGION_HALF_SIZE / region.half
     centre = middle + rotation.T @ region.centre
     scene = upright.in_frame(np.eye(3), region.centre, scale)
     # Points cannot prove that nothing lies beyond the cube: sky and plain walls have none. Only alpha does.
@@ -86,7 +86,7 @@ def normalise(
         near=near,
         far=far,
         beyond_alpha=contradicted,
-        beyond=share_beyond(scene, np.zeros(3), REGION_HALF),
+        beyond=share_beyond(scene, np.zeros(3), REGION_HALF_SIZE),
         arc_deg=_arc_deg(scene.centres),
     )
 

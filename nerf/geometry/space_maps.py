@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf import REGION_HALF
+from nerf import REGION_HALF_SIZE
 from nerf.geometry.contraction import contract, uncontract
 from nerf.geometry.rays import Rays
 
@@ -81,7 +81,7 @@ class Box:
     """The cube [-0.9, 0.9]³ of the scene frame."""
 
     kind: Literal["box"] = "box"
-    half: ClassVar[float] = REGION_HALF
+    half: ClassVar[float] = REGION_HALF_SIZE
     bends_rays: ClassVar[bool] = False
     unbounded: ClassVar[bool] = False
 
@@ -134,7 +134,7 @@ class Ndc:
     slopes: tuple[float, float]
     near: float
     kind: Literal["ndc"] = "ndc"
-    half: ClassVar[float] = REGION_HALF
+    half: ClassVar[float] = REGION_HALF_SIZE
     bends_rays: ClassVar[bool] = False
     unbounded: ClassVar[bool] = True
 

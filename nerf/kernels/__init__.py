@@ -23,33 +23,33 @@ from typing import NamedTuple, Protocol, runtime_checkable
 from jaxtyping import Float, Float64, Int, Int32, Int64, UInt8
 from torch import Tensor
 
-from nerf import REGION_HALF
+from nerf import REGION_HALF_SIZE
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 
-BOX = REGION_HALF  # half the side of the cube that a bounded scene fills
-ALIGNED_ROWS = 4  # of four features: a cache line, and a whole number of vectors for Adam
+BOX = REGION_HALF_SIZE  # half the side of the cube that a bounded scene fills
+ROW_ALIGNMENT = 4  # of four features: a cache line, and a whole number of vectors for Adam
 CONTRACTED_BOX = 2.0  # half the side of the contracted space
 
 
 class GridLayout(NamedTuple):
     """A table that holds the vertices of several grids over the unit cube: level after level, a row per vertex.
 
-    Level l has ``resolutions[l]`` cells along each axis and owns the rows [first_rows[l], first_rows[l + 1]), the last
-    few of which may belong to no vertex. Where these suffice for all (R + 1)³ vertices, vertex (x, y, z) has row
-    first_rows[l] + (x (R + 1) + y) (R + 1) + z (a dense level). Otherwise their number is a power of two, and vertices
-    share rows by the hash (x ⊕ 2654435761 y ⊕ 805459861 z) mod rows, in unsigned 32-bit arithmetic (Müller et al.
-    2022, eq. 4).
+    Level l has ``resolutions[l]`` cells along each axis and owns the rows [level_offsets[l], level_offsets[l + 1]), the
+    last few of which may belong to no vertex. Where these suffice for all (R + 1)³ vertices, vertex (x, y, z) has row
+    level_offsets[l] + (x (R + 1) + y) (R + 1) + z (a dense level). Otherwise their number is a power of two, and
+    vertices share rows by the hash (x ⊕ 2654435761 y ⊕ 805459861 z) mod rows, in unsigned 32-bit arithmetic (Müller et
+    al. 2022, eq. 4).
     """
 
     resolutions: tuple[int, ...]
-    first_rows: tuple[int, ...]
+    level_offsets: tuple[int, ...]
     features: int
 
     @property
     def rows(self) -> int:
         """Rows of the whole table."""
-        return self.first_rows[-1]
+        return self.level_offsets[-1]
 
     @property
     def width(self) -> int:
@@ -58,9 +58,9 @@ class GridLayout(NamedTuple):
 
     def level_rows(self, level: int) -> int:
         """Rows of one level."""
-        return self.first_rows[level + 1] - self.first_rows[level]
+        return self.level_offsets[level + 1] - self.level_offsets[level]
 
-    def hashed(self, level: int) -> bool:
+    def is_hashed(self, level: int) -> bool:
         """Whether vertices of a level share rows."""
         return self.level_rows(level) < (self.resolutions[level] + 1) ** 3
 
@@ -73,11 +73,11 @@ def grid_layout(
     first = base_res if num_levels > 1 else max_res
     growth = (max_res / first) ** (1 / max(1, num_levels - 1))
     resolutions = tuple(round(first * growth**level) for level in range(num_levels))
-    first_rows = [0]
+    level_offsets = [0]
     for resolution in resolutions:
-        vertices = -(-((resolution + 1) ** 3) // ALIGNED_ROWS) * ALIGNED_ROWS
-        first_rows.append(first_rows[-1] + min(vertices, 1 << log2_hashmap_size))
-    return GridLayout(resolutions, tuple(first_rows), features_per_level)
+        vertices = -(-((resolution + 1) ** 3) // ROW_ALIGNMENT) * ROW_ALIGNMENT
+        level_offsets.append(level_offsets[-1] + min(vertices, 1 << log2_hashmap_size))
+    return GridLayout(resolutions, tuple(level_offsets), features_per_level)
 
 
 class RayStepping(NamedTuple):
@@ -175,7 +175,7 @@ class Backend(Protocol):
     ) -> Float[Tensor, "rays 3"]: ...
 
     def add_ray_relu(
-        self, samples: Samples, hidden: Float[Tensor, "samples 64"], of_ray: Float[Tensor, "rays 64"]
+        self, samples: Samples, hidden: Float[Tensor, "samples 64"], ray_hidden: Float[Tensor, "rays 64"]
     ) -> None: ...
 
     def add_ray_relu_backward(
@@ -203,8 +203,8 @@ class Backend(Protocol):
         samples: Samples,
         sigma: Float[Tensor, "samples"],
         threshold: float,
-        thin: float,
-        offset: Float[Tensor, "rays"],
+        thinning_threshold: float,
+        thinning_offset: Float[Tensor, "rays"],
     ) -> tuple[Samples, Int32[Tensor, "kept"]]: ...
 
     def composite(

@@ -14,10 +14,10 @@ from nerf.runtime.parallel import in_order, workers
 from nerf.runtime.profiler import Profiler, WorkCounts
 
 MATMUL_ROWS = 1 << 13  # points that one product has, as in a chunk of a step
-GATHERED = 1 << 17  # rows read at once, of 4 float32, as a grid's table has them
+GATHERED_ROWS = 1 << 17  # rows read at once, of 4 float32, as a grid's table has them
 # float32 that all cores together copy at once: 128 MB read and as much written, more than their shared cache holds (60
-# to 105 MB on servers); each at least MIN_STREAMED, which its own cache does not.
-STREAMED, MIN_STREAMED = 1 << 25, 1 << 22
+# to 105 MB on servers); each at least MIN_STREAMED_FLOATS, which its own cache does not.
+STREAMED_FLOATS, MIN_STREAMED_FLOATS = 1 << 25, 1 << 22
 MIN_RUNS = 3
 
 
@@ -62,11 +62,11 @@ def measure_gather(device: torch.device, rows: int, seconds: float) -> float:
 
     def make() -> Callable[[], object]:
         random = torch.Generator().manual_seed(0)
-        index = torch.randint(rows, (GATHERED,), generator=random).to(device)
-        found = torch.empty(GATHERED, dtype=torch.complex128, device=device)
+        index = torch.randint(rows, (GATHERED_ROWS,), generator=random).to(device)
+        found = torch.empty(GATHERED_ROWS, dtype=torch.complex128, device=device)
         return lambda: torch.index_select(table, 0, index, out=found)
 
-    return GATHERED / _best_on_every_core(make, device, seconds)
+    return GATHERED_ROWS / _best_on_every_core(make, device, seconds)
 
 
 def measure_copy(device: torch.device, seconds: float) -> float:
@@ -83,7 +83,7 @@ def measure_copy(device: torch.device, seconds: float) -> float:
 
 def copied_bytes(device: torch.device) -> int:
     """How much each core copies at once in :func:`measure_copy`."""
-    return 4 * max(MIN_STREAMED, STREAMED // _cores(device))
+    return 4 * max(MIN_STREAMED_FLOATS, STREAMED_FLOATS // _cores(device))
 
 
 def _cores(device: torch.device) -> int:

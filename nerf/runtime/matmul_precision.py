@@ -19,14 +19,15 @@ from nerf.runtime.machine_rates import MATMUL_ROWS, MIN_RUNS
 
 Precision = Literal["highest", "medium"]
 
-USUAL_WIDTH = 64  # of the networks; of wider ones fewer rows make as much work
+REFERENCE_WIDTH = 64  # of the networks; of wider ones fewer rows make as much work
 MIN_ROWS = 256
-TRIED_SECONDS = 0.06  # for both precisions together
+TRIAL_SECONDS = 0.06  # for both precisions together
 MIN_SPEEDUP, MAX_MATMUL_ERROR = 1.3, 1e-4
 
 
-class Medium(NamedTuple):
-    """Products at "medium": how many times faster than at "highest" they are, and how far off (:func:`error_of`)."""
+class MediumPrecision(NamedTuple):
+    """Products at "medium": how many times faster than at "highest" they are, and how far off
+    (:func:`matmul_error`)."""
 
     speedup: float
     error: float
@@ -37,7 +38,7 @@ class Medium(NamedTuple):
         return self.error <= MAX_MATMUL_ERROR
 
     @property
-    def pays(self) -> bool:
+    def is_worthwhile(self) -> bool:
         """Whether training should use it: clearly faster, and about as exact."""
         return self.is_exact and self.speedup >= MIN_SPEEDUP
 
@@ -54,19 +55,19 @@ def use_matmul_precision(precision: Precision | None) -> Iterator[None]:
 
 
 @functools.cache
-def measure_medium_matmul(device: torch.device, width: int) -> Medium:
+def measure_medium_matmul(device: torch.device, width: int) -> MediumPrecision:
     """Of products (n, width) x (width, width), the fastest of several at each precision in turn; once in a process, in
     a tenth of a second. Changes no random state."""
     random = torch.Generator(device).manual_seed(0)
-    rows = max(MIN_ROWS, min(MATMUL_ROWS, MATMUL_ROWS * USUAL_WIDTH**2 // width**2))
+    rows = max(MIN_ROWS, min(MATMUL_ROWS, MATMUL_ROWS * REFERENCE_WIDTH**2 // width**2))
     a, b = (torch.randn(count, width, generator=random, device=device) for count in (rows, width))
     with use_matmul_precision("medium"):
-        error = error_of(a @ b, a, b)
+        error = matmul_error(a @ b, a, b)
     seconds = _fastest(a, b)
-    return Medium(seconds["highest"] / seconds["medium"], error)
+    return MediumPrecision(seconds["highest"] / seconds["medium"], error)
 
 
-def error_of(found: Float[Tensor, "rows n"], a: Float[Tensor, "rows m"], b: Float[Tensor, "m n"]) -> float:
+def matmul_error(found: Float[Tensor, "rows n"], a: Float[Tensor, "rows m"], b: Float[Tensor, "m n"]) -> float:
     """‖found - a b‖ / ‖a b‖, the product in float64."""
     exact = a.double() @ b.double()
     return float((found - exact).norm() / exact.norm())
@@ -75,16 +76,16 @@ def error_of(found: Float[Tensor, "rows n"], a: Float[Tensor, "rows m"], b: Floa
 def _fastest(a: Tensor, b: Tensor) -> dict[Precision, float]:
     """Seconds of the fastest product at each precision."""
     seconds: dict[Precision, float] = {"highest": float("inf"), "medium": float("inf")}
-    until, runs = time.perf_counter() + TRIED_SECONDS, 0
+    until, runs = time.perf_counter() + TRIAL_SECONDS, 0
     while runs < MIN_RUNS or time.perf_counter() < until:
         runs += 1
         for precision, least in seconds.items():
             with use_matmul_precision(precision):
-                seconds[precision] = min(least, seconds_of_product(a, b))
+                seconds[precision] = min(least, matmul_seconds(a, b))
     return seconds
 
 
-def seconds_of_product(a: Tensor, b: Tensor) -> float:
+def matmul_seconds(a: Tensor, b: Tensor) -> float:
     """What one takes at the precision that torch is set to."""
     _wait_for(a.device)
     started = time.perf_counter()

@@ -50,7 +50,7 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], device: 
     pool, under_way = _pool(count), deque[Future[Result]]()
     try:
         for item in items:
-            under_way.append(pool.submit(_worked, function, item))
+            under_way.append(pool.submit(_profiled, function, item))
             if len(under_way) > 2 * count:
                 yield under_way.popleft().result()
         while under_way:
@@ -60,7 +60,7 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], device: 
             future.cancel()
 
 
-def _worked(function: Callable[[Item], Result], item: Item) -> Result:
+def _profiled(function: Callable[[Item], Result], item: Item) -> Result:
     with span(OTHER):
         return function(item)
 

@@ -1,4 +1,4 @@
-"""One optimisation step of a hash-grid field, behind the same interface as the paper's (nerf/training/trainer.py)."""
+"""One optimisation step of a hash-grid field (:class:`nerf.training.trainer.FieldTrainer`)."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -27,22 +27,21 @@ from nerf.training.losses import huber_loss
 from nerf.training.metrics import psnr
 from nerf.training.pixel_sampler import PixelSampler
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.trainer import RAYS, NonFinite, StepResult, all_finite
+from nerf.training.trainer import RAY_GEOMETRY, NonFinite, StepResult, all_finite
 
 LR_WARMUP_STEPS = 20
-# Of the run, before the rate begins to fall. A fall over most of the run costs short runs up to 2 dB and gains long
-# ones nothing (docs/experiments/learning_rate.md); and what is measured before it does not depend on how long the run
-# will be.
+# Fraction of the run before the learning rate begins to decay. A decay over most of the run costs short runs up to 2 dB
+# and gains long ones nothing (docs/experiments/learning_rate.md), and what is measured before it does not depend on how
+# long the run will be.
 LR_HOLD_FRACTION = 0.75
-LR_FINAL_FRACTION = 0.05  # of the rate at first
-# The distortion loss begins weak: it draws fog together wherever that stands, and far things that only smooth colours
-# tell apart (the sky) would be drawn close behind the scene before their place is known
-# (docs/experiments/learning_rate.md).
-INITIAL_DISTORTION = 0.25  # of its weight
+LR_FINAL_FRACTION = 0.05  # of the base learning rate
+# The distortion loss begins weak: it concentrates floaters wherever they are, and distant surfaces of smooth colour
+# (the sky) would be pulled close behind the scene before their depth is known (docs/experiments/learning_rate.md).
+INITIAL_DISTORTION_FRACTION = 0.25  # of its weight
 FULL_DISTORTION_PROGRESS = 0.3  # of the run
-DEPTH_RAY_INTERVAL = 8  # one ray in so many runs to a sparse point, where some are known
+DEPTH_RAY_INTERVAL = 8  # one ray in so many goes through the pixel of a sparse point, where some are known
 INITIAL_SAMPLES_PER_RAY = 128.0
-# A ray is not free, though it may need no colour: no step has more rays than if each needed so many.
+# A ray is not free, even if no colour is evaluated on it: this limits the rays of a step.
 MIN_SAMPLES_PER_RAY = 2.0
 # Of the table's entries, how many have a gradient in a step: of 5 grids of 2^18 rows with 33 to 49 k colours 0.29 to
 # 0.36 (docs/experiments/step_time.md); larger steps reach more.
@@ -56,42 +55,42 @@ SAMPLES_PER_RAY_EMA_DECAY = 0.9  # how much of the mean of samples per ray remai
 class HashGridTrainerSettings:
     """How to train.
 
-    ``samples``: colours to evaluate in a step; its rays are as many as are expected to need them. ``chunks``: equal
-    micro-batches of a step, each computed on a core; results depend on their number, not on that of the cores.
-    ``background`` is what lies behind a scene without a background model: a colour, or another random one for each ray
-    (only for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight of the
-    distortion loss, for scenes without a known background. ``depth_loss``: initial weight of the sparse depth loss, at
-    the pixels whose distance the dataset knows. ``least_photos``: that must see a cell of unbounded space for
-    something to stand before their foregrounds (nerf/fields/frustum_mask.py), or all but one where they are few.
+    ``target_samples``: colour evaluations per step; the number of rays follows from it. ``micro_batches``: equal parts
+    of a step, each computed on a core; results depend on their number, not on that of the cores. ``background``: the
+    colour behind a scene without a background model, or another random one for each ray (only for photos with alpha,
+    where it shows the field which space is empty). ``distortion_weight``: full weight of the distortion loss, for
+    scenes without a known background. ``depth_weight``: initial weight of the sparse depth loss. ``min_photos``: how
+    many photos must see a cell of unbounded space before their foregrounds for it to hold density
+    (nerf/fields/frustum_mask.py), or all but one where they are few.
     """
 
     seed: int
     background: tuple[float, float, float] | Literal["random"]
-    samples: int = 1 << 14
-    chunks: int = 1
-    rate: float = 2e-2
-    distortion: float = 0.0
-    depth_loss: float = 0.0
-    least_photos: int = 1
+    target_samples: int = 1 << 14
+    micro_batches: int = 1
+    learning_rate: float = 2e-2
+    distortion_weight: float = 0.0
+    depth_weight: float = 0.0
+    min_photos: int = 1
 
 
 class HashGridBatch(NamedTuple):
-    """Rays with the colour each should see over its background, where its samples stand in their intervals and which of
-    its thin ones are kept (both in [0, 1)), whose view it belongs to, and how far away is the sparse point that it runs
-    to; 0: to none."""
+    """Rays with their target colours, which are composited over ``background``. ``jitter`` places the samples in their
+    intervals, ``thinning_offset`` decides which thin samples are kept (both in [0, 1)). ``view`` is the image of a ray,
+    ``sparse_depth`` the distance of the sparse point on it; 0: there is none."""
 
     rays: Rays
     target: Float[Tensor, "rays 3"]
     background: Float[Tensor, "rays 3"]
     jitter: Float[Tensor, "rays"]
-    offset: Float[Tensor, "rays"]
+    thinning_offset: Float[Tensor, "rays"]
     view: Int[Tensor, "rays"]
-    distance: Float[Tensor, "rays"]
+    sparse_depth: Float[Tensor, "rays"]
 
 
 class Loss(NamedTuple):
-    """A chunk's share of the loss, of the mean squared error in it, and the gradients of rendering, weights and of
-    the colour effects' parameters."""
+    """A micro-batch's share of the loss and of its mean squared error, and the gradients of rendering, weights and
+    colour effects' parameters."""
 
     value: Tensor
     squared_error: Tensor
@@ -100,37 +99,37 @@ class Loss(NamedTuple):
     grad_effects: dict[str, Tensor]
 
 
-class _Part(NamedTuple):
-    """What one micro-batch contributes: loss, gradients and their norm, the optical thickness of its samples, and how
-    many densities it evaluated."""
+class _MicroBatch(NamedTuple):
+    """What one micro-batch contributes: loss, gradients and their norm, the optical thickness of its samples, and the
+    number of density evaluations."""
 
     batch: HashGridBatch
     loss: Tensor
     squared_error: Tensor
-    weights: Weights
-    features: Float[Tensor, "samples width"]
+    grad_networks: Weights
+    grad_features: Float[Tensor, "samples width"]
     points: Float[Tensor, "samples 3"]
-    background: dict[str, Tensor]
-    effects: dict[str, Tensor]
-    norm: Tensor
-    thickness: Float[Tensor, "samples"]
-    densities: int
+    grad_background: dict[str, Tensor]
+    grad_effects: dict[str, Tensor]
+    grad_norm: Tensor
+    optical_thickness: Float[Tensor, "samples"]
+    density_evaluations: int
 
 
 def lr_multiplier(step: int, progress: float) -> float:
     """The learning rate over its base: a linear warm-up, then constant, then falling exponentially."""
-    fallen = max(0.0, progress - LR_HOLD_FRACTION) / (1 - LR_HOLD_FRACTION)
-    return min(1.0, (step + 1) / LR_WARMUP_STEPS) * LR_FINAL_FRACTION**fallen
+    decayed = max(0.0, progress - LR_HOLD_FRACTION) / (1 - LR_HOLD_FRACTION)
+    return min(1.0, (step + 1) / LR_WARMUP_STEPS) * LR_FINAL_FRACTION**decayed
 
 
 def distortion_multiplier(progress: float) -> float:
     """The weight of the distortion loss over its full one: from a quarter it grows with the progress of the run."""
-    return min(1.0, max(INITIAL_DISTORTION, progress / FULL_DISTORTION_PROGRESS))
+    return min(1.0, max(INITIAL_DISTORTION_FRACTION, progress / FULL_DISTORTION_PROGRESS))
 
 
 def depth_loss_multiplier(progress: float) -> float:
-    """The weight of the depth loss over its first one: it falls to nothing over the run. Shape is decided early, and
-    once it is about right photos know it better than points do."""
+    """The weight of the sparse depth loss over its initial one: it falls to zero over the run. Geometry is decided
+    early, and once it is about right the photos constrain it better than the points do."""
     return 1 - progress
 
 
@@ -146,43 +145,45 @@ class HashGridTrainer:
         effects: ImageEffects = NO_EFFECTS,
     ) -> None:
         self.model, self.settings, self.effects = model, settings, effects
-        # Nothing beyond the box of a bounded scene is drawn: a point there would pull the light to its walls.
+        # Nothing beyond the box of a bounded scene is rendered: a point there would pull density to its walls.
         self.dataset = dataset if model.space.unbounded else dataset.with_sparse_depths_within(BOX)
-        self.occupancy_grid = OccupancyGrid(model, self._usable())
-        of_networks = model.weights._asdict()
+        self.occupancy_grid = OccupancyGrid(model, self._frustum_mask())
+        networks = model.weights._asdict()
         self.background = {"background_table": model.background_table} if model.settings.background_model else {}
-        self.parameters = {"table": model.table, **of_networks, **self.background, **effects.parameters}
+        self.parameters = {"table": model.table, **networks, **self.background, **effects.parameters}
         self.exp_avg = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.exp_avg_sq = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.grad_table = torch.zeros_like(model.table)
         tables = model.table, self.grad_table, self.exp_avg["table"], self.exp_avg_sq["table"]
         self.levels = [
-            tuple(tensor[first:end] for tensor in tables) for first, end in pairwise(model.layout.first_rows)
+            tuple(tensor[first:end] for tensor in tables) for first, end in pairwise(model.layout.level_offsets)
         ]
         self.samples_per_ray = torch.tensor(INITIAL_SAMPLES_PER_RAY, dtype=torch.float64)
-        self.order = PixelSampler(self.dataset.unmasked_count, settings.seed, dataset.device)
-        self.drawn = torch.tensor(0)  # pixels of that order so far; steps differ in how many they take
+        self.pixel_sampler = PixelSampler(self.dataset.unmasked_count, settings.seed, dataset.device)
+        self.pixels_sampled = torch.tensor(0)  # so far; steps differ in how many they take
 
-    def _usable(self) -> Bool[Tensor, "cells"] | None:
-        """Known only where points tell where foregrounds begin, in unbounded space: a box is carved beforehand."""
-        least, space = min(self.settings.least_photos, len(self.dataset.near) - 1), self.model.space
-        if least <= 1 or self.dataset.known is None or not space.unbounded:
+    def _frustum_mask(self) -> Bool[Tensor, "cells"] | None:
+        """Only in unbounded space and with sparse points, which tell where foregrounds begin; else None."""
+        min_photos, space = min(self.settings.min_photos, len(self.dataset.near) - 1), self.model.space
+        if min_photos <= 1 or self.dataset.sparse_pixels is None or not space.unbounded:
             return None
-        return compute_frustum_mask(self.dataset, space, least, self.model.stepping.occupancy_resolution)
+        return compute_frustum_mask(self.dataset, space, min_photos, self.model.stepping.occupancy_resolution)
 
     def step(self, step: int, progress: float, lr_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
-        device, rays = self.dataset.device, self._rays_per_chunk()
-        parts = list(in_order(partial(self._part, step, progress, rays), range(self.settings.chunks), device))
-        loss, error = self._finite(step, parts)
-        self._update(parts, lr_scale * lr_multiplier(step, progress), step + 1)
-        with span("cache"):
-            self.occupancy_grid.update(step, generator(device, self.settings.seed, step, self.settings.chunks))
-        samples = sum(len(each.points) for each in parts)
-        rays *= self.settings.chunks
-        self.drawn += self._of_photos(rays, progress)
-        self.samples_per_ray.mul_(SAMPLES_PER_RAY_EMA_DECAY).add_((1 - SAMPLES_PER_RAY_EMA_DECAY) * samples / rays)
-        return StepResult(loss, psnr(error), rays, samples, sum(each.densities for each in parts))
+        device, count, rays = self.dataset.device, self.settings.micro_batches, self._rays_per_micro_batch()
+        compute = partial(self._compute_micro_batch, step, progress, rays)
+        micro_batches = list(in_order(compute, range(count), device))
+        loss, error = self._check_finite(step, micro_batches)
+        self._update(micro_batches, lr_scale * lr_multiplier(step, progress), step + 1)
+        with span("occupancy"):
+            self.occupancy_grid.update(step, generator(device, self.settings.seed, step, count))
+        colours = sum(len(each.points) for each in micro_batches)
+        densities = sum(each.density_evaluations for each in micro_batches)
+        rays *= count
+        self.pixels_sampled += self._photo_ray_count(rays, progress)
+        self.samples_per_ray.mul_(SAMPLES_PER_RAY_EMA_DECAY).add_((1 - SAMPLES_PER_RAY_EMA_DECAY) * colours / rays)
+        return StepResult(loss, psnr(error), rays, colours, densities)
 
     def state(self) -> dict[str, Tensor]:
         """Weights and occupancy bits as ``model.<name>``, per-image parameters as ``image.<effect>.<name>``, Adam's
@@ -194,173 +195,192 @@ class HashGridTrainer:
             | {f"exp_avg.{name}": tensor for name, tensor in self.exp_avg.items()}
             | {f"exp_avg_sq.{name}": tensor for name, tensor in self.exp_avg_sq.items()}
             | {"optical_thickness": self.occupancy_grid.optical_thickness}
-            | {"samples_per_ray": self.samples_per_ray, "drawn": self.drawn}
+            | {"samples_per_ray": self.samples_per_ray, "pixels_sampled": self.pixels_sampled}
             | {"settings": torch.frombuffer(bytearray(repr(self.model.settings).encode()), dtype=torch.uint8)}
         )
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Go back to what :meth:`state` gave. Raises RuntimeError for the state of another field, also where its
+        """Restore what :meth:`state` gave. Raises RuntimeError for the state of another field, also where its
         tables have the same shapes."""
-        mine = self.state()
-        different = [name for name in sorted(mine.keys() | state.keys()) if _shape(mine, name) != _shape(state, name)]
-        if not different and not torch.equal(mine["settings"], state["settings"].to(mine["settings"].device)):
+        own = self.state()
+        different = [name for name in sorted(own.keys() | state.keys()) if _shape(own, name) != _shape(state, name)]
+        if not different and not torch.equal(own["settings"], state["settings"].to(own["settings"].device)):
             different = ["settings"]
         if different:
             raise RuntimeError(f"this state belongs to another field: {', '.join(different)} differ")
-        for name, tensor in mine.items():
+        for name, tensor in own.items():
             tensor.copy_(state[name])
 
-    def _rays_per_chunk(self) -> int:
-        wanted = int(self.settings.samples / max(MIN_SAMPLES_PER_RAY, float(self.samples_per_ray)))
-        return max(1, wanted // self.settings.chunks)
+    def _rays_per_micro_batch(self) -> int:
+        rays = int(self.settings.target_samples / max(MIN_SAMPLES_PER_RAY, float(self.samples_per_ray)))
+        return max(1, rays // self.settings.micro_batches)
 
-    def _batch(self, step: int, progress: float, chunk: int, count: int) -> HashGridBatch:
+    def _batch(self, step: int, progress: float, index: int, count: int) -> HashGridBatch:
+        """The ``count`` rays of micro-batch number ``index``."""
         device = self.dataset.device
-        random = generator(device, self.settings.seed, step, chunk)
-        # Shared out over the chunks, which are small where cores are many and the field is young.
-        first, end = self._of_photos(chunk * count, progress), self._of_photos((chunk + 1) * count, progress)
-        pixel = self.dataset.nth(self.order.take(int(self.drawn) + first, end - first))
-        to_points, distance = count - len(pixel), torch.zeros(count, device=device)
-        if to_points:
-            of_points, distance[-to_points:] = self.dataset.sample_sparse_depths(to_points, random)
-            pixel = torch.cat([pixel, of_points])
+        random = generator(device, self.settings.seed, step, index)
+        # Counted over the whole step: a micro-batch alone may be too small for a single ray to a sparse point.
+        first, end = (self._photo_ray_count(number * count, progress) for number in (index, index + 1))
+        pixel = self.dataset.unmasked_pixels(self.pixel_sampler.take(int(self.pixels_sampled) + first, end - first))
+        sparse_count, sparse_depth = count - len(pixel), torch.zeros(count, device=device)
+        if sparse_count:
+            sparse_pixels, sparse_depth[-sparse_count:] = self.dataset.sample_sparse_depths(sparse_count, random)
+            pixel = torch.cat([pixel, sparse_pixels])
         rays, colour, alpha, view = self.dataset.lookup(pixel)
         if self.settings.background == "random":
             background = torch.rand(count, 3, generator=random, device=device)
         else:
             background = torch.tensor(self.settings.background, device=device).repeat(count, 1)
         target = colour if alpha is None else torch.lerp(background, colour, alpha[:, None])
-        jitter, offset = torch.rand(2, count, generator=random, device=device)
-        return HashGridBatch(rays, target, background, jitter, offset, view, distance)
+        jitter, thinning_offset = torch.rand(2, count, generator=random, device=device)
+        return HashGridBatch(rays, target, background, jitter, thinning_offset, view, sparse_depth)
 
-    def _of_photos(self, rays: int, progress: float) -> int:
-        """How many of so many rays run through pixels of all the photos; the others run to sparse points."""
+    def _photo_ray_count(self, rays: int, progress: float) -> int:
+        """How many of so many rays go through pixels of the sampler; the others go to sparse points."""
         return rays - rays // DEPTH_RAY_INTERVAL if self._has_depth_loss(progress) else rays
 
     def _has_depth_loss(self, progress: float) -> bool:
-        return self.dataset.known is not None and self.settings.depth_loss * depth_loss_multiplier(progress) > 0
-
-    def _part(self, step: int, progress: float, rays: int, chunk: int) -> _Part:
-        """What a chunk of so many rays adds to loss and gradients."""
-        with span("batch"):
-            batch = self._batch(step, progress, chunk, rays)
-            seen_along = self.effects.forward_rays(batch.rays, batch.view)
-            if not all_finite(seen_along):
-                raise NonFinite(RAYS, step, _whole([batch]))
-        done = self.model.forward(seen_along, batch.jitter, batch.offset, batch.background)
-        with span("composite"):
-            loss = self._loss(rays * self.settings.chunks, progress, done, batch)
-        with span("backward", self._backward_work(done)):
-            gradients = self.model.backward(done, loss.grad, loss.grad_weights)
-            effects = loss.grad_effects | self.effects.backward_rays(
-                batch.rays, batch.view, lambda: RayGradients(*self.model.rays_backward(done, gradients))
-            )
-            background = {name: self.model.background_backward(done, gradients) for name in self.background}
-        weights, features, *_ = gradients
-        norm = torch.nn.utils.get_total_norm([*weights, features, *background.values(), *effects.values()])
-        of_loss = loss.value, loss.squared_error
-        return _Part(
-            batch, *of_loss, weights, features, done.points, background, effects, norm, done.thickness, done.marched
+        return (
+            self.dataset.sparse_pixels is not None and self.settings.depth_weight * depth_loss_multiplier(progress) > 0
         )
 
-    def _backward_work(self, done: HashGridPass) -> WorkCounts:
-        weights = self.model.weights
-        products = 2 * (mlp.density_flops(weights) + mlp.colour_flops(weights)) * len(done.points)
-        to_points = CORNERS * len(self.model.layout.resolutions) * len(done.points) if self.effects.rays else 0
-        return WorkCounts(products, to_points)
+    def _compute_micro_batch(self, step: int, progress: float, rays: int, index: int) -> _MicroBatch:
+        """What micro-batch number ``index``, of so many rays, adds to loss and gradients."""
+        with span("batch"):
+            batch = self._batch(step, progress, index, rays)
+            effect_rays = self.effects.forward_rays(batch.rays, batch.view)
+            if not all_finite(effect_rays):
+                raise NonFinite(RAY_GEOMETRY, step, _joined([batch]))
+        forward_pass = self.model.forward(effect_rays, batch.jitter, batch.thinning_offset, batch.background)
+        with span("composite"):
+            loss = self._loss(rays * self.settings.micro_batches, progress, forward_pass, batch)
+        with span("backward", self._backward_work(forward_pass)):
+            gradients = self.model.backward(forward_pass, loss.grad, loss.grad_weights)
+            effects = loss.grad_effects | self.effects.backward_rays(
+                batch.rays, batch.view, lambda: RayGradients(*self.model.rays_backward(forward_pass, gradients))
+            )
+            background = {name: self.model.background_backward(forward_pass, gradients) for name in self.background}
+        networks, features, *_ = gradients
+        return _MicroBatch(
+            batch,
+            loss.value,
+            loss.squared_error,
+            grad_networks=networks,
+            grad_features=features,
+            points=forward_pass.points,
+            grad_background=background,
+            grad_effects=effects,
+            grad_norm=torch.nn.utils.get_total_norm([*networks, features, *background.values(), *effects.values()]),
+            optical_thickness=forward_pass.optical_thickness,
+            density_evaluations=forward_pass.density_evaluations,
+        )
 
-    def _loss(self, rays: int, progress: float, done: HashGridPass, batch: HashGridBatch) -> Loss:
-        seen = RenderedRays(done.rendering, batch.background, batch.rays, batch.view)
+    def _backward_work(self, forward_pass: HashGridPass) -> WorkCounts:
+        weights, points = self.model.weights, len(forward_pass.points)
+        flops = 2 * (mlp.density_flops(weights) + mlp.colour_flops(weights)) * points
+        rows = CORNERS * len(self.model.layout.resolutions) * points if self.effects.rays else 0
+        return WorkCounts(flops, rows)
+
+    def _loss(self, rays: int, progress: float, forward_pass: HashGridPass, batch: HashGridBatch) -> Loss:
+        seen = RenderedRays(forward_pass.rendering, batch.background, batch.rays, batch.view)
         error = self.effects.residual(seen, batch.target)
-        robust, pull = huber_loss(error)
-        grad, effects = self.effects.backward_residual(seen, pull * (2 / (3 * rays)))
-        value, grad_weights = robust.sum() / (3 * rays), torch.zeros_like(done.weights)
+        huber, half_gradient = huber_loss(error)
+        grad, effects = self.effects.backward_residual(seen, half_gradient * (2 / (3 * rays)))
+        value, grad_weights = huber.sum() / (3 * rays), torch.zeros_like(forward_pass.weights)
         backend, stepping = self.model.backend, self.model.stepping
-        if self.settings.distortion:
-            each = torch.full_like(batch.distance, self.settings.distortion * distortion_multiplier(progress) / rays)
-            lengths = done.samples.dt / done.mapped.scene_length(done.samples.t, done.samples.ray)
-            marched = done.samples._replace(dt=lengths)
-            value = value + (each * backend.distortion(marched, done.weights, stepping)).sum()
-            grad_weights = backend.distortion_backward(marched, done.weights, stepping, each)
+        mapped, samples = forward_pass.mapped, forward_pass.samples
+        if self.settings.distortion_weight:
+            per_ray = self.settings.distortion_weight * distortion_multiplier(progress) / rays
+            each = torch.full_like(batch.sparse_depth, per_ray)
+            marched = samples._replace(dt=samples.dt / mapped.scene_length(samples.t, samples.ray))
+            value = value + (each * backend.distortion(marched, forward_pass.weights, stepping)).sum()
+            grad_weights = backend.distortion_backward(marched, forward_pass.weights, stepping, each)
         if self._has_depth_loss(progress):
-            each = torch.full_like(batch.distance, self.settings.depth_loss * depth_loss_multiplier(progress) / rays)
-            places = done.mapped.rays.far, done.mapped.from_scene(batch.distance), stepping
-            apart = backend.depth_loss(done.samples, done.weights, done.rendering.opacity, *places)
-            value = value + (each * apart).sum()
-            of_weights, of_opacity = backend.depth_loss_backward(done.samples, *places, each)
-            grad_weights, grad = grad_weights + of_weights, grad._replace(opacity=grad.opacity + of_opacity)
+            per_ray = self.settings.depth_weight * depth_loss_multiplier(progress) / rays
+            each = torch.full_like(batch.sparse_depth, per_ray)
+            arguments = mapped.rays.far, mapped.from_scene(batch.sparse_depth), stepping
+            depth_loss = backend.depth_loss(samples, forward_pass.weights, forward_pass.rendering.opacity, *arguments)
+            value = value + (each * depth_loss).sum()
+            more_weights, more_opacity = backend.depth_loss_backward(samples, *arguments, each)
+            grad_weights, grad = grad_weights + more_weights, grad._replace(opacity=grad.opacity + more_opacity)
         return Loss(value, error.square().sum() / (3 * rays), grad, grad_weights, effects)
 
-    def _finite(self, step: int, parts: Sequence[_Part]) -> tuple[float, float]:
-        """Loss and squared error as numbers, once they and all gradients are known to be finite.
+    def _check_finite(self, step: int, micro_batches: Sequence[_MicroBatch]) -> tuple[float, float]:
+        """Loss and squared error as numbers. Raises NonFinite unless they and all gradients are finite.
 
         The table's gradient is a sum of the features' gradients with weights up to 1: finite if their norm is.
         """
-        each = zip(*((chunk.loss, chunk.squared_error, chunk.norm) for chunk in parts), strict=True)
+        each = zip(*((one.loss, one.squared_error, one.grad_norm) for one in micro_batches), strict=True)
         # One wait for the GPU, not three.
         loss_now, error_now, norm_now = torch.stack([torch.stack(values).sum() for values in each]).tolist()
         for quantity, value in {"loss": loss_now, "gradient": norm_now}.items():
             if not abs(value) < float("inf"):
-                raise NonFinite(quantity, step, _whole([chunk.batch for chunk in parts]))
+                raise NonFinite(quantity, step, _joined([each.batch for each in micro_batches]))
         return loss_now, error_now
 
-    def _update(self, parts: Sequence[_Part], factor: float, adam_step: int) -> None:
-        """Update the table's levels, which progress no rows, the networks, the per-image parameters and the occupancy
+    def _update(self, micro_batches: Sequence[_MicroBatch], factor: float, adam_step: int) -> None:
+        """Update the table's levels, which share no rows, the networks, the per-image parameters and the occupancy
         grid, each on a core. ``factor`` scales all learning rates."""
         finest_first = range(len(self.model.layout.resolutions) - 1, -1, -1)  # no core waits long for the last
-        learning_rate = self.settings.rate * factor
-        work = [partial(self._update_level, level, parts, learning_rate, adam_step) for level in finest_first]
-        of_networks = [chunk.weights._asdict() for chunk in parts]
-        work.append(partial(self._update_small, Weights._fields, of_networks, learning_rate, adam_step))
-        of_background = [*(chunk.background for chunk in parts), self._background_prior(parts)]
-        work.append(
-            partial(self._update_small, self.background, of_background, BACKGROUND_LR_SCALE * learning_rate, adam_step)
-        )
-        work.append(partial(self._raise_occupancy, parts))
+        learning_rate = self.settings.learning_rate * factor
+        work = [partial(self._update_level, level, micro_batches, learning_rate, adam_step) for level in finest_first]
+        networks = [each.grad_networks._asdict() for each in micro_batches]
+        work.append(partial(self._update_small, Weights._fields, networks, learning_rate, adam_step))
+        background = [*(each.grad_background for each in micro_batches), self._background_prior(micro_batches)]
+        background_lr = BACKGROUND_LR_SCALE * learning_rate
+        work.append(partial(self._update_small, self.background, background, background_lr, adam_step))
+        work.append(partial(self._raise_occupancy, micro_batches))
         for effect in self.effects.all:
-            work.append(partial(self._update_effect, effect, parts, effect.learning_rate * factor, adam_step))
+            work.append(partial(self._update_effect, effect, micro_batches, effect.learning_rate * factor, adam_step))
         for _ in in_order(lambda update: update(), work, self.dataset.device):
             pass
 
-    def _background_prior(self, parts: Sequence[_Part]) -> dict[str, Tensor]:
+    def _background_prior(self, micro_batches: Sequence[_MicroBatch]) -> dict[str, Tensor]:
         """The prior's gradient of the background where rays of this batch reach it; elsewhere it stays as it is."""
-        rays = sum(len(chunk.batch.jitter) for chunk in parts)
+        rays = sum(len(each.batch.jitter) for each in micro_batches)
         touched = {
-            name: torch.stack([chunk.background[name] for chunk in parts]).sum(0) != 0 for name in self.background
+            name: torch.stack([each.grad_background[name] for each in micro_batches]).sum(0) != 0
+            for name in self.background
         }
         return {name: BACKGROUND_PRIOR / rays * table * touched[name] for name, table in self.background.items()}
 
-    def _update_level(self, level: int, parts: Sequence[_Part], learning_rate: float, adam_step: int) -> None:
+    def _update_level(
+        self, level: int, micro_batches: Sequence[_MicroBatch], learning_rate: float, adam_step: int
+    ) -> None:
         layout, backend = self.model.layout, self.model.backend
-        with span("scatter", WorkCounts(gathered_rows=CORNERS * sum(len(each.points) for each in parts))):
-            for each in parts:
-                backend.encode_backward_table(layout, level, each.points, each.features, self.grad_table)
+        with span("scatter", WorkCounts(gathered_rows=CORNERS * sum(len(each.points) for each in micro_batches))):
+            for each in micro_batches:
+                backend.encode_backward_table(layout, level, each.points, each.grad_features, self.grad_table)
         table, grad, exp_avg, exp_avg_sq = self.levels[level]
         with span("optimiser", WorkCounts(streamed_bytes=ADAM_BYTES * table.numel())):
             backend.adam(table, grad, exp_avg, exp_avg_sq, learning_rate, adam_step)
 
     def _update_small(
-        self, names: Iterable[str], of_parts: Sequence[dict[str, Tensor]], learning_rate: float, adam_step: int
+        self, names: Iterable[str], gradients: Sequence[dict[str, Tensor]], learning_rate: float, adam_step: int
     ) -> None:
         """Of parameters that are small beside the table."""
         with span("optimiser"):
             for name in names:
-                gradient = torch.stack([each[name] for each in of_parts]).sum(0)
+                gradient = torch.stack([each[name] for each in gradients]).sum(0)
                 parameter, exp_avg, exp_avg_sq = self.parameters[name], self.exp_avg[name], self.exp_avg_sq[name]
                 self.model.backend.adam(parameter, gradient, exp_avg, exp_avg_sq, learning_rate, adam_step)
 
-    def _update_effect(self, effect: Effect, parts: Sequence[_Part], learning_rate: float, adam_step: int) -> None:
-        self._update_small(parameters_of(effect), [chunk.effects for chunk in parts], learning_rate, adam_step)
+    def _update_effect(
+        self, effect: Effect, micro_batches: Sequence[_MicroBatch], learning_rate: float, adam_step: int
+    ) -> None:
+        self._update_small(
+            parameters_of(effect), [each.grad_effects for each in micro_batches], learning_rate, adam_step
+        )
         effect.fix_gauge()
 
-    def _raise_occupancy(self, parts: Sequence[_Part]) -> None:
-        with span("cache"):
-            for each in parts:
-                self.occupancy_grid.raise_to(each.points, each.thickness)
+    def _raise_occupancy(self, micro_batches: Sequence[_MicroBatch]) -> None:
+        with span("occupancy"):
+            for each in micro_batches:
+                self.occupancy_grid.raise_to(each.points, each.optical_thickness)
 
 
-def _whole(batches: Sequence[HashGridBatch]) -> dict[str, Tensor]:
-    """A batch by the names of its tensors, its chunks put together again."""
+def _joined(batches: Sequence[HashGridBatch]) -> dict[str, Tensor]:
+    """Micro-batches joined to one batch, by the names of its tensors."""
     rays = zip(*(batch.rays for batch in batches), strict=True)
     rest = zip(*(batch[1:] for batch in batches), strict=True)
     names = (*Rays._fields, *HashGridBatch._fields[1:])

@@ -1,6 +1,7 @@
-"""What a curve of quality against training time tells: the last doubling of the time, the next one, the knee.
+"""What a curve of quality against training time tells: the gain of its last doubling, the predicted gain of the next
+one, and from when on returns diminish.
 
-A curve is a sequence of (seconds, dB), rising in seconds, of one run. Between its points quality is linear in the
+A curve is a sequence of (seconds, dB) of one run, rising in seconds. Between its points quality is linear in the
 logarithm of time.
 """
 
@@ -10,12 +11,12 @@ from typing import NamedTuple
 
 Curve = Sequence[tuple[float, float]]
 
-KNEE_DB = 0.5
-"""A doubling of the time that buys less than this is past the knee: about the least that people see side by side."""
+MIN_DOUBLING_GAIN_DB = 0.5
+"""Returns have diminished once a doubling of the time gains less: about the least that people see side by side."""
 
 
-class Gain(NamedTuple):
-    """Decibels, and half the width of the interval that holds the truth four times out of five."""
+class PredictedGain(NamedTuple):
+    """Decibels, and half the width of the 80 % prediction interval."""
 
     db: float
     half_width: float
@@ -32,38 +33,38 @@ def quality_at(curve: Curve, seconds: float) -> float:
     return low + (high - low) * math.log(seconds / early) / math.log(late / early)
 
 
-def last_doubling(curve: Curve) -> float | None:
-    """What the second half of the time bought, in dB; None where the curve does not reach back that far."""
+def last_doubling_gain(curve: Curve) -> float | None:
+    """The gain over the second half of the time, in dB; None where the curve does not reach back that far."""
     if len(curve) < 2 or curve[0][0] > curve[-1][0] / 2:
         return None
     return curve[-1][1] - quality_at(curve, curve[-1][0] / 2)
 
 
-def knee(curve: Curve) -> float | None:
-    """The seconds from which on every doubling of the time bought less than KNEE_DB; None while doublings buy more, or
-    where the curve does not reach back far enough to tell."""
-    if last_doubling(curve) is None:
+def diminishing_returns_seconds(curve: Curve) -> float | None:
+    """The seconds from which on every doubling of the time bought less than MIN_DOUBLING_GAIN_DB; None while doublings
+    buy more, or where the curve does not reach back far enough to tell."""
+    if last_doubling_gain(curve) is None:
         return None
     half, found = curve[-1][0] / 2, None
     for seconds in [half, *(time for time, _ in reversed(curve) if time < half)]:
-        if quality_at(curve, 2 * seconds) - quality_at(curve, seconds) >= KNEE_DB:
+        if quality_at(curve, 2 * seconds) - quality_at(curve, seconds) >= MIN_DOUBLING_GAIN_DB:
             break
         found = seconds
     return found
 
 
 # Least squares over 32 pairs of runs of T and 2 T steps of the hash-grid field, eight sets
-# (docs/experiments/learning_curve.md): what a run gained from half of its time to its end, annealing included, against
-# what a run of twice the time ends higher.
-MIN_STEPS = 500  # a shorter run is still fog, and tells nothing of a longer one
-NEXT_OF_LAST = 0.71
-NEXT_HALF_WIDTH = 0.37  # dB: held four of five, each judged by the other sets
+# (docs/experiments/learning_curve.md): the gain of a run from half of its time to its end, decay phase included,
+# against how much higher a run of twice the time ends.
+MIN_STEPS = 500  # a shorter run is still all floaters, and tells nothing of a longer one
+PREDICTED_GAIN_RATIO = 0.71
+PREDICTED_GAIN_HALF_WIDTH = 0.37  # dB: it covers four of five sets, each predicted from the others
 
 
-def next_doubling(curve: Curve, steps: int) -> Gain | None:
-    """What a run of twice the time is predicted to end higher than this one of ``steps``; None where these are fewer
-    than MIN_STEPS, and as :func:`last_doubling`."""
-    last = last_doubling(curve)
+def predicted_doubling_gain(curve: Curve, steps: int) -> PredictedGain | None:
+    """How much higher a run of twice the time is predicted to end than this one of ``steps``; None below MIN_STEPS, and
+    as :func:`last_doubling_gain`."""
+    last = last_doubling_gain(curve)
     if last is None or steps < MIN_STEPS:
         return None
-    return Gain(NEXT_OF_LAST * last, NEXT_HALF_WIDTH)
+    return PredictedGain(PREDICTED_GAIN_RATIO * last, PREDICTED_GAIN_HALF_WIDTH)

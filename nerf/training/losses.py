@@ -17,5 +17,5 @@ def huber_loss(
     Adam divides by the root mean square of an entry's gradients, so that a few large errors, of an edge that is not
     there yet, of a passer-by or a highlight, would slow all small ones down.
     """
-    pull = error.clamp(-HUBER_DELTA, HUBER_DELTA)
-    return pull * (2 * error - pull), pull
+    half_gradient = error.clamp(-HUBER_DELTA, HUBER_DELTA)
+    return half_gradient * (2 * error - half_gradient), half_gradient

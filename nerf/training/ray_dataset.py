@@ -40,26 +40,27 @@ class RayDataset(NamedTuple):
     View v owns the pixels [first_pixel[v], first_pixel[v + 1]); ``pixels`` have 3 channels, or 4 with a straight (not
     premultiplied) alpha. What a look-up needs of a view stands in two tables with a column per view:
 
-    * ``layout``: its first pixel, its width, its camera's first patch, patches in a row;
-    * ``geometry``: the rotation scene_from_camera row by row, the centre, near, far, patches per pixel along x and y.
+    * ``view_layout``: its first pixel, its width, its camera's first patch, patches in a row;
+    * ``view_geometry``: the rotation scene_from_camera row by row, the centre, near, far, patches per pixel along x and
+    y.
 
     ``patches`` has a column per patch: the direction in its middle, and how it changes along x and y over one patch.
 
     ``runs`` has a column per run of unmasked pixels: how many unmasked pixels lie before it, and its first pixel. A
     last column has the number of all of them. None: no pixel is masked.
 
-    ``known`` are pixels that show a sparse point, ``distance`` how far along their rays (scene units) it lies. None: of
-    no pixel is that known.
+    ``sparse_pixels`` are pixels that show a sparse point, ``sparse_depths`` how far along their rays (scene units) it
+    lies. None: of no pixel is that known.
     """
 
     pixels: UInt8[Tensor, "pixels channels"]
     first_pixel: Int[Tensor, "views_and_end"]
-    layout: Int[Tensor, "4 views"]
-    geometry: Float[Tensor, "16 views"]
+    view_layout: Int[Tensor, "4 views"]
+    view_geometry: Float[Tensor, "16 views"]
     patches: Float[Tensor, "9 patches"]
     runs: Int[Tensor, "2 runs_and_end"] | None = None
-    known: Int[Tensor, "known"] | None = None
-    distance: Float[Tensor, "known"] | None = None
+    sparse_pixels: Int[Tensor, "known"] | None = None
+    sparse_depths: Float[Tensor, "known"] | None = None
 
     @property
     def device(self) -> torch.device:
@@ -69,17 +70,17 @@ class RayDataset(NamedTuple):
     @property
     def near(self) -> Float[Tensor, "views"]:
         """Per view, where rays begin."""
-        return self.geometry[12]
+        return self.view_geometry[12]
 
     @property
     def viewing_distance(self) -> Float[Tensor, "views"] | None:
         """Per view, the median of how far away its known pixels show something (scene units): of all that are known
         where it has none; None where nothing is known."""
-        if self.known is None or self.distance is None:
+        if self.sparse_pixels is None or self.sparse_depths is None:
             return None
-        view = torch.searchsorted(self.first_pixel, self.known, right=True).sub_(1)
+        view = torch.searchsorted(self.first_pixel, self.sparse_pixels, right=True).sub_(1)
         counts = torch.bincount(view, minlength=len(self.near)).tolist()
-        of_all, of_views = self.distance.median(), self.distance[view.argsort(stable=True)].split(counts)
+        of_all, of_views = self.sparse_depths.median(), self.sparse_depths[view.argsort(stable=True)].split(counts)
         return torch.stack([each.median() if len(each) else of_all for each in of_views])
 
     def to(self, device: torch.device | str) -> "RayDataset":
@@ -92,10 +93,10 @@ class RayDataset(NamedTuple):
         """How many pixels no mask excludes."""
         return len(self.pixels) if self.runs is None else int(self.runs[0, -1])
 
-    def without(self, ignored: Iterable[Bool[Tensor, "_ _"] | None]) -> "RayDataset":
-        """This dataset with pixels that :meth:`draw` never gives: per view, (height, width) True where the photo is to
-        be ignored, None where all of it is used. Taken one by one, for together they may not fit into memory. Raises
-        ValueError if no pixel is left."""
+    def with_masks(self, ignored: Iterable[Bool[Tensor, "_ _"] | None]) -> "RayDataset":
+        """This dataset with pixels that :meth:`sample_pixels` never gives: per view, (height, width) True where the
+        photo is to be ignored, None where all of it is used. Taken one by one, for together they may not fit into
+        memory. Raises ValueError if no pixel is left."""
         runs = _runs(ignored, self.first_pixel)
         if runs[0, -1] == len(self.pixels):
             return self
@@ -103,29 +104,33 @@ class RayDataset(NamedTuple):
             raise ValueError("the masks ignore every pixel")
         return self._replace(runs=runs.to(self.device))
 
-    def with_sparse_depths(self, pixel: Int[Tensor, "known"], distance: Float[Tensor, "known"]) -> "RayDataset":
+    def with_sparse_depths(self, pixel: Int[Tensor, "known"], sparse_depths: Float[Tensor, "known"]) -> "RayDataset":
         """This dataset with sparse depths: how far along their rays (scene units) these pixels show a sparse point.
 
         Left out are pixels that may not be drawn (so give the masks first), those that are not wholly opaque, whose
         light ends in part elsewhere, and distances that are not between near and far of their views: no sample stands
         there, and what does would be pulled to the end of the ray."""
-        near, far = self.geometry[12:].index_select(1, torch.searchsorted(self.first_pixel, pixel, right=True) - 1)[:2]
-        kept = self.is_unmasked(pixel) & (near < distance) & (distance < far)
+        near, far = self.view_geometry[12:].index_select(
+            1, torch.searchsorted(self.first_pixel, pixel, right=True) - 1
+        )[:2]
+        kept = self.is_unmasked(pixel) & (near < sparse_depths) & (sparse_depths < far)
         if self.pixels.shape[1] == 4:
             kept &= self.pixels.index_select(0, pixel)[:, 3] == 255
-        return self._knowing(pixel[kept], distance[kept].float())
+        return self._with_sparse(pixel[kept], sparse_depths[kept].float())
 
     def with_sparse_depths_within(self, half: float) -> "RayDataset":
         """This dataset without the known distances that end outside of the cube from -``half`` to ``half``."""
-        if self.known is None or self.distance is None:
+        if self.sparse_pixels is None or self.sparse_depths is None:
             return self
-        rays, _ = self.rays(self.known)
-        inside = ((rays.origins + self.distance[:, None] * rays.directions).abs() <= half).all(-1)
-        return self._knowing(self.known[inside], self.distance[inside])
+        rays, _ = self.rays(self.sparse_pixels)
+        inside = ((rays.origins + self.sparse_depths[:, None] * rays.directions).abs() <= half).all(-1)
+        return self._with_sparse(self.sparse_pixels[inside], self.sparse_depths[inside])
 
-    def _knowing(self, pixel: Int[Tensor, "known"], distance: Float[Tensor, "known"]) -> "RayDataset":
-        known = len(pixel) > 0
-        return self._replace(known=pixel if known else None, distance=distance if known else None)
+    def _with_sparse(self, pixel: Int[Tensor, "known"], sparse_depths: Float[Tensor, "known"]) -> "RayDataset":
+        sparse_pixels = len(pixel) > 0
+        return self._replace(
+            sparse_pixels=pixel if sparse_pixels else None, sparse_depths=sparse_depths if sparse_pixels else None
+        )
 
     def lookup(self, pixel: Int[Tensor, "rays"]) -> PixelBatch:
         """Given pixels, and the rays through them."""
@@ -136,16 +141,18 @@ class RayDataset(NamedTuple):
     def rays(self, pixel: Int[Tensor, "rays"]) -> tuple[Rays, Int[Tensor, "rays"]]:
         """The rays through pixels, and whose views they are; the photos, which may be on disk, are not read."""
         view = torch.searchsorted(self.first_pixel, pixel, right=True).sub_(1)
-        geometry = self.geometry.index_select(1, view)
-        direction = self._direction(pixel, self.layout.index_select(1, view), geometry[14:])
-        directions = (geometry[:9].view(3, 3, -1) * direction).sum(1)
-        return Rays(geometry[9:12].T.contiguous(), directions.T.contiguous(), geometry[12], geometry[13]), view
+        view_geometry = self.view_geometry.index_select(1, view)
+        direction = self._direction(pixel, self.view_layout.index_select(1, view), view_geometry[14:])
+        directions = (view_geometry[:9].view(3, 3, -1) * direction).sum(1)
+        return Rays(
+            view_geometry[9:12].T.contiguous(), directions.T.contiguous(), view_geometry[12], view_geometry[13]
+        ), view
 
     def _direction(
-        self, pixel: Int[Tensor, "rays"], layout: Int[Tensor, "4 rays"], per_pixel: Float[Tensor, "2 rays"]
+        self, pixel: Int[Tensor, "rays"], view_layout: Int[Tensor, "4 rays"], per_pixel: Float[Tensor, "2 rays"]
     ) -> Float[Tensor, "3 rays"]:
         """Unit directions in the camera frame: of the patch, b + u db/du + v db/dv, with (u, v) from its middle."""
-        first_pixel, width, first_patch, across = layout
+        first_pixel, width, first_patch, across = view_layout
         within = pixel - first_pixel
         row = within // width
         x, y = (within - row * width + 0.5) * per_pixel[0], (row + 0.5) * per_pixel[1]  # in patches
@@ -155,11 +162,13 @@ class RayDataset(NamedTuple):
         direction = torch.addcmul(torch.addcmul(patch[:3], patch[3:6], u), patch[6:], v)
         return direction / direction.square().sum(0).sqrt_()
 
-    def draw(self, count: int, generator: torch.Generator) -> Int[Tensor, "rays"]:
+    def sample_pixels(self, count: int, generator: torch.Generator) -> Int[Tensor, "rays"]:
         """``count`` pixels drawn uniformly from those that may be, with replacement."""
-        return self.nth(torch.randint(self.unmasked_count, (count,), generator=generator, device=self.device))
+        return self.unmasked_pixels(
+            torch.randint(self.unmasked_count, (count,), generator=generator, device=self.device)
+        )
 
-    def nth(self, number: Int[Tensor, "rays"]) -> Int[Tensor, "rays"]:
+    def unmasked_pixels(self, number: Int[Tensor, "rays"]) -> Int[Tensor, "rays"]:
         """The pixels that have these numbers, from 0 on, among those that may be drawn."""
         return number if self.runs is None else _in_runs(self.runs, number)
 
@@ -167,9 +176,9 @@ class RayDataset(NamedTuple):
         self, count: int, generator: torch.Generator
     ) -> tuple[Int[Tensor, "rays"], Float[Tensor, "rays"]]:
         """``count`` of the pixels whose distance is known, drawn uniformly with replacement, and their distances."""
-        assert self.known is not None and self.distance is not None, "the dataset has no sparse depths"
-        drawn = torch.randint(len(self.known), (count,), generator=generator, device=self.device)
-        return self.known.index_select(0, drawn), self.distance.index_select(0, drawn)
+        assert self.sparse_pixels is not None and self.sparse_depths is not None, "the dataset has no sparse depths"
+        drawn = torch.randint(len(self.sparse_pixels), (count,), generator=generator, device=self.device)
+        return self.sparse_pixels.index_select(0, drawn), self.sparse_depths.index_select(0, drawn)
 
     def is_unmasked(self, pixel: Int[Tensor, "*rays"]) -> Bool[Tensor, "*rays"]:
         """Whether no mask excludes these pixels."""
@@ -193,7 +202,7 @@ def make_ray_dataset(
     sizes: Sequence[tuple[int, int]],
     camera_of: Sequence[int],
     camera_directions: Sequence[Float[Tensor, "_ _ 3"]],
-    placement: PosedViews,
+    posed_views: PosedViews,
 ) -> RayDataset:
     """The dataset of photos that are laid end to end already.
 
@@ -222,13 +231,15 @@ def make_ray_dataset(
     first_patch = _starts([rows * columns for rows, columns in grids])
     cameras = torch.tensor(camera_of)
     grid, size = torch.tensor(grids)[cameras], torch.tensor(sizes)
-    poses, near, far = placement
+    poses, near, far = posed_views
     rotations, centres = poses[:, :, :3].reshape(-1, 9), poses[:, :, 3]
     return RayDataset(
         pixels=pixels,
         first_pixel=first_pixel,
-        layout=torch.stack([first_pixel[:-1], size[:, 1], first_patch[cameras], grid[:, 1]]),
-        geometry=torch.cat([rotations, centres, near[:, None], far[:, None], (grid / size).flip(1)], 1).T.contiguous(),
+        view_layout=torch.stack([first_pixel[:-1], size[:, 1], first_patch[cameras], grid[:, 1]]),
+        view_geometry=torch.cat(
+            [rotations, centres, near[:, None], far[:, None], (grid / size).flip(1)], 1
+        ).T.contiguous(),
         patches=torch.cat([_patches(directions) for directions in camera_directions], 1),
     )
 

@@ -16,27 +16,27 @@ from nerf.geometry.rays import Rays
 
 
 class StepResult(NamedTuple):
-    """What one step did: its loss, the PSNR (dB) of the final rendering on its batch, how many rays it drew, how many
-    samples (points on them whose colour it computed), and how many points whose density it asked for."""
+    """What one step did: its loss, the PSNR (dB) of the final rendering on its batch, the number of rays, and the
+    number of points on them at which it evaluated colour and density."""
 
     loss: float
     psnr: float
     rays: int
-    samples: int
-    densities: int
+    colour_evaluations: int
+    density_evaluations: int
 
 
 class FieldTrainer(Protocol):
-    """What the training loop needs of any kind of field. Tensors of a state carry everything that a step changes."""
+    """What the training loop needs of a field's trainer. The state's tensors carry everything that a step changes."""
 
     @property
     def model(self) -> RadianceModel:
-        """The field as it is now."""
+        """The field in training."""
         ...
 
     @property
     def effects(self) -> ImageEffects:
-        """What stands between it and the images."""
+        """The effects between the field and the images."""
         ...
 
     def step(self, step: int, progress: float, lr_scale: float) -> StepResult:
@@ -44,11 +44,11 @@ class FieldTrainer(Protocol):
         ...
 
     def state(self) -> dict[str, Tensor]:
-        """The live tensors of model and optimiser; copy them to keep them."""
+        """The tensors of model and optimiser themselves; copy them to keep them."""
         ...
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Go back to a saved state."""
+        """Restore a saved state."""
         ...
 
 
@@ -60,19 +60,19 @@ class NonFinite(Exception):
         self.quantity, self.step, self.batch = quantity, step, batch
 
 
-RAYS = "geometry of rays"
+RAY_GEOMETRY = "geometry of rays"
 
 
 def all_finite(rays: Rays) -> bool:
-    """Whether samples can be placed on all of them. What is no number would drop out of the comparisons that cut a ray
-    to a box, and the ray would count as one that meets nothing."""
+    """Whether all rays are finite. NaN would drop out of the comparisons that clip a ray to the box, and the ray would
+    count as empty."""
     return bool(torch.cat([each.flatten() for each in rays]).isfinite().all())
 
 
-def over(
+def composite_over(
     colour: Float[Tensor, "*rays 3"], alpha: Float[Tensor, "*rays"] | None, background: Float[Tensor, "3"]
 ) -> Float[Tensor, "*rays 3"]:
-    """A pixel of straight alpha over a background; without alpha, the pixel itself."""
+    """Composite colours with straight alpha over a background; without alpha, return the colours."""
     if alpha is None:
         return colour
     return background + alpha[..., None] * (colour - background)

@@ -19,7 +19,7 @@ from nerf.training.metrics import psnr
 from nerf.training.pixel_sampler import PixelSampler
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.schedule import learning_rate
-from nerf.training.trainer import RAYS, NonFinite, StepResult, all_finite, over
+from nerf.training.trainer import RAY_GEOMETRY, NonFinite, StepResult, all_finite, composite_over
 
 # Rays per chunk of a batch, each on its own core; elsewhere a batch is one chunk. Their gradients are added in order,
 # so results do not depend on the number of cores.
@@ -39,8 +39,8 @@ class VanillaTrainerSettings:
     batch_rays: int
     seed: int
     background: tuple[float, float, float] | Literal["random"]
-    rate_start: float = 5e-4
-    rate_end: float = 5e-5
+    initial_learning_rate: float = 5e-4
+    final_learning_rate: float = 5e-5
 
 
 class Batch(NamedTuple):
@@ -85,7 +85,7 @@ class VanillaTrainer:
         groups = [{"params": networks, "of_start": 1.0}]
         for effect in effects.all:
             learnt = [parameter.requires_grad_() for parameter in effect.parameters.values()]
-            groups.append({"params": learnt, "of_start": effect.learning_rate / settings.rate_start})
+            groups.append({"params": learnt, "of_start": effect.learning_rate / settings.initial_learning_rate})
         self.parameters = [parameter for group in groups for parameter in group["params"]]
         self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=PUBLISHED_EPSILON, fused=True)
 
@@ -105,7 +105,9 @@ class VanillaTrainer:
                 raise NonFinite(quantity, step, _tensors_of(batch))
         for parameter, gradient in zip(self.parameters, gradients, strict=True):
             parameter.grad = gradient
-        rate = lr_scale * learning_rate(progress, self.settings.rate_start, self.settings.rate_end)
+        rate = lr_scale * learning_rate(
+            progress, self.settings.initial_learning_rate, self.settings.final_learning_rate
+        )
         for group in self.optimiser.param_groups:
             group["lr"] = rate * group["of_start"]
         with span("optimiser", WorkCounts(streamed_bytes=ADAM_BYTES * sum(each.numel() for each in self.parameters))):
@@ -114,7 +116,7 @@ class VanillaTrainer:
             for effect in self.effects.all:
                 effect.fix_gauge()
         rays, queries = self.settings.batch_rays, self.settings.batch_rays * self.model.settings.queries_per_ray
-        return StepResult(loss, psnr(error), rays, samples=queries, densities=queries)
+        return StepResult(loss, psnr(error), rays, colour_evaluations=queries, density_evaluations=queries)
 
     def _part(self, batch: Batch, step: int, start: int) -> _Part:
         """What a slice of the batch adds to loss and gradient; it draws its samples from its own random numbers."""
@@ -123,7 +125,7 @@ class VanillaTrainer:
         random = generator(self.dataset.device, self.settings.seed, step, 1 + start)
         seen_along = self.effects.forward_rays(rays, view)
         if not all_finite(seen_along):
-            raise NonFinite(RAYS, step, _tensors_of(batch))
+            raise NonFinite(RAY_GEOMETRY, step, _tensors_of(batch))
         coarse, fine = self.model.render_training(seen_along, background, random)
 
         def squared_error(rendering: Rendering) -> Float[Tensor, ""]:
@@ -175,12 +177,14 @@ class VanillaTrainer:
     def _batch(self, step: int) -> Batch:
         random = generator(self.dataset.device, self.settings.seed, step)
         count = self.settings.batch_rays
-        rays, colour, alpha, view = self.dataset.lookup(self.dataset.nth(self.order.take(step * count, count)))
+        rays, colour, alpha, view = self.dataset.lookup(
+            self.dataset.unmasked_pixels(self.order.take(step * count, count))
+        )
         if self.settings.background == "random":
             background = torch.rand(3, generator=random, device=self.dataset.device)
         else:
             background = torch.tensor(self.settings.background, device=self.dataset.device)
-        return Batch(rays, over(colour, alpha, background), view, background)
+        return Batch(rays, composite_over(colour, alpha, background), view, background)
 
 
 def _tensors_of(batch: Batch) -> dict[str, Tensor]:

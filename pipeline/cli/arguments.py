@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from pipeline.cli.options import UsageError, wrong_options
 from pipeline.engine.settings import Settings
 from stages.render import Config as RenderConfig
-from stages.train.config import GRID_ONLY, PAPER_ONLY
+from stages.train.config import FIELD_NAMES, PRESET_FIELDS
 from stages.train.config import Config as TrainConfig
 
 T = TypeVar("T")
@@ -205,11 +205,9 @@ def _without_replaced(recorded: TrainConfig, words: Sequence[str]) -> TrainConfi
     if given := {option for option in ("steps", "seconds", "preset") if _gives(words, f"--train.{option}")}:
         # A preset is a budget, too, unless one is counted; and a new training does not go on from another.
         replaced |= {"steps", "seconds", "after", "more_steps", "more_seconds"} - given
-    wanted = _given(words, "--train.field")
-    if wanted == "paper":
-        replaced |= {*GRID_ONLY}
-    elif wanted == "grid":
-        replaced |= {*PAPER_ONLY, *(["preset"] if recorded.preset == "paper" else [])}
+    if (wanted := _given(words, "--train.field")) in FIELD_NAMES:
+        replaced |= {*FIELD_NAMES} - {wanted}
+        replaced |= {"preset"} if PRESET_FIELDS.get(recorded.preset or "", wanted) != wanted else set()
     return recorded.model_copy(update={name: TrainConfig.model_fields[name].default for name in replaced})
 
 

@@ -14,6 +14,7 @@ from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace, is
 from stages.contract import bounded
 from stages.effects.effect_list import EFFECTS
 from stages.ingest.sources import find_source, is_gone
+from stages.train.config import OPTIONS_OF_FIELD
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -61,7 +62,8 @@ def _wrong_option(name: str, problem: "ErrorDetails") -> str:
     if problem["type"] == "extra_forbidden":
         return f"there is no option {name}"
     if problem["type"] == "value_error":
-        return f"{name}: {problem['msg'].removeprefix('Value error, ')}"
+        reason = problem["msg"].removeprefix("Value error, ")
+        return reason if reason.startswith("--") else f"{name}: {reason}"  # of several options it names them itself
     must = problem["msg"].removeprefix("Input should ")
     for long, short in (("greater than or equal to", "at least"), ("less than or equal to", "at most")):
         must = must.replace(long, short)
@@ -111,8 +113,9 @@ def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Setti
 
 def check_fitted_poses(settings: Settings) -> None:
     """Raises UsageError where stage evaluate would refuse to fit poses: better now than after the training."""
-    if settings.evaluate.fit_poses == "on" and settings.train.kind == "paper":
-        what = "--evaluate.fit-poses on is for the hash-grid field, and the options of training ask for the paper field"
+    field = settings.train.kind
+    if settings.evaluate.fit_poses == "on" and not OPTIONS_OF_FIELD[field].tells_ray_gradients:
+        what = f"--evaluate.fit-poses on has no effect with the {field} field, which the options of training ask for"
         raise UsageError(f"{what}; give --evaluate.fit-poses auto")
 
 

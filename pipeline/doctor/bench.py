@@ -21,7 +21,7 @@ TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all of 
 # (docs/experiments/ray_samples.md).
 DENSITIES = {"bounded": 7, "contracted": 24}
 WHERE = {"bounded": "around an object", "contracted": "in unbounded space"}
-PAPER_RAYS = {"paper field as published": (8, 256, 64, 128), "paper field 4 × 64": (4, 64, 32, 32)}
+VANILLA_RAYS = {"vanilla NeRF as published": (8, 256, 64, 128), "vanilla NeRF 4 × 64": (4, 64, 32, 32)}
 
 
 def bench_lines(device: torch.device) -> list[str]:
@@ -56,8 +56,8 @@ def _meaning(products: dict[int, float], reads: float, copied: float, count: int
         most = count / Rates(products[64], reads, copied).seconds(work)
         text = f"hash-grid field {WHERE[space]} ({SAMPLES_PER_RAY[space]} colours, {densities} densities a ray)"
         lines.append(f"  {short_count(most):>8} rays/s  {text}")
-    for name, sizes in PAPER_RAYS.items():
-        most = count / Rates(products[sizes[1]], reads, copied).seconds(WorkCounts(matmul_flops=paper_products(*sizes)))
+    for name, sizes in VANILLA_RAYS.items():
+        most = count / Rates(products[sizes[1]], reads, copied).seconds(WorkCounts(matmul_flops=vanilla_flops(*sizes)))
         lines.append(f"  {short_count(most):>8} rays/s  {name}")
     return lines
 
@@ -65,7 +65,7 @@ def _meaning(products: dict[int, float], reads: float, copied: float, count: int
 def grid_work(contracted: bool, densities: float) -> WorkCounts:
     """Of a ray in training, its share of the optimiser's included: a large field, in the steps that stage train takes
     on this machine."""
-    asked = Config(field="grid", contracted=contracted, view_dependence=True)
+    asked = Config(contracted=contracted, view_dependence=True)
     config = timed(with_defaults(asked), compute_device())
     model = HashGridField(field_settings(config, sky=False), 0, reference)
     density, colour = mlp.density_flops(model.weights), mlp.colour_flops(model.weights)
@@ -75,7 +75,7 @@ def grid_work(contracted: bool, densities: float) -> WorkCounts:
     return WorkCounts(densities * density + colours * (colour + 2 * (density + colour)), rows, adam)
 
 
-def paper_products(depth: int, width: int, coarse: int, fine: int) -> int:
-    """Multiplications and additions of a ray of the paper's field in training."""
+def vanilla_flops(depth: int, width: int, coarse: int, fine: int) -> int:
+    """Multiplications and additions of a ray of the vanilla NeRF in training."""
     model = VanillaNerf(VanillaSettings(depth=depth, width=width, samples_coarse=coarse, samples_fine=fine), 0)
     return model.settings.queries_per_ray * (model.fine.matmul_flops + model.fine.matmul_flops_backward)

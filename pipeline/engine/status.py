@@ -1,5 +1,6 @@
 """What is cached, stale, half done or never run, and why a stage would run; reads only, runs nothing."""
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,7 @@ from pipeline.engine.manifests import BadManifest, Manifest
 from pipeline.engine.runner import Runner
 from pipeline.engine.stage_list import STAGES, command_that_makes
 from pipeline.engine.workspace import Workspace
-from stages.contract import KEY_LENGTH, StageError, declared
+from stages.contract import KEY_LENGTH, Options, StageError, declared
 
 
 @dataclass(frozen=True)
@@ -83,15 +84,21 @@ def differences(job: Job, last: Manifest) -> list[str]:
     found = []
     if last.version != job.module.VERSION:
         found.append(f"the stage itself changed (version {last.version} → {job.module.VERSION})")
-    now: dict[str, Any] = job.config.model_dump(mode="json")
-    for name in sorted({*now, *last.config} - set(declared(job.module, "NOT_HASHED"))):
-        before, after = last.config.get(name), now.get(name)
-        if before != after:
-            found.append(f"{job.stage}.{name}: {before} → {after}")
+    now: dict[str, Any] = job.config.model_dump(mode="json", exclude=set(declared(job.module, "NOT_HASHED")))
+    found += [f"{job.stage}.{change}" for change in _changes(job.config, now, last.config)]
     found += _other_inputs(job.inputs, last)
     if not found and last.key != job.key:
         found.append("the content of a file that its settings name changed")
     return found
+
+
+def _changes(options: Options, now: Mapping[str, Any], before: Mapping[str, Any]) -> Iterator[str]:
+    """Which ``options`` have another value ``now`` than ``before``, where both know them."""
+    for name in sorted(now.keys() & before.keys()):
+        if isinstance(nested := getattr(options, name), Options):
+            yield from (f"{name}.{change}" for change in _changes(nested, now[name], before[name]))
+        elif now[name] != before[name]:
+            yield f"{name}: {before[name]} → {now[name]}"
 
 
 def explain(workspace: Workspace, runner: Runner, stage: str) -> list[str]:

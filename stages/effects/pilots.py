@@ -27,15 +27,16 @@ from stages.hardware.backend import chosen_backend
 from stages.hardware.device import compute_device, cores
 from stages.train.config import BLACK, Config
 from stages.train.data import ALL_MASKED, PhotoReader, guided_dataset, view_mask, view_rays
-from stages.train.fields import make_trainer, with_defaults
+from stages.train.fields.field_list import make_trainer, with_defaults
+from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.planning import seconds_per_step
-from stages.train.validation_images import set_aside
+from stages.train.validation_images import split_off_validation
 
 LONG_SIDE = 200  # pixels of the photos in a pilot
 MAX_KEPT = 4  # of the training photos, to judge by; with fewer than MIN_FOR_INTERVAL their own noise is not known
 SEEDS = 3
-BATCH_SAMPLES = 1 << 13  # half the usual: a pilot has to be short, and is judged early
-CHUNKS = 4  # fixed, so that a pilot ends the same whatever the machine
+TARGET_SAMPLES = 1 << 13  # half the usual: a pilot has to be short, and is judged early
+MICRO_BATCHES = 4  # fixed, so that a pilot ends the same whatever the machine
 BESIDE_TRAINING = 0.3  # of the time of the trainings: reading photos, the warm-up, scoring
 # Of a pilot's training, on one core, that take as long as fitting the pose of a photo kept back and drawing it again:
 # 7 in the scenes of tests/effect_scenes.py where alpha ends space, 20 to 26 where nothing does.
@@ -88,7 +89,7 @@ class _Trained(NamedTuple):
 
 def pilot_scene(inputs: Inputs, scene: Scene, progress: Progress) -> PilotScene | str:
     """Small photos to train on and to judge by, both from the training photos; or why there can be no pilot."""
-    split = set_aside(scene, MAX_KEPT, MIN_FOR_INTERVAL)
+    split = split_off_validation(scene, MAX_KEPT, MIN_FOR_INTERVAL)
     if split is None:
         return "too few training photos"
     cameras = [scene.cameras[view.camera] for view in scene.views]
@@ -130,7 +131,7 @@ def expected_seconds(scene: Scene, steps: int) -> tuple[float, float]:
     per_step = seconds_per_step(_config(arm, steps, device), scene, arm, device)
     trainings = (1 + BESIDE_TRAINING) * 2 * SEEDS * steps * per_step
     on_cpu = per_step if device == "cpu" else seconds_per_step(_config(arm, steps, "cpu"), scene, arm, "cpu")
-    return trainings, trainings + 2 * SEEDS * MAX_KEPT * STEPS_PER_FIT * on_cpu * min(CHUNKS, cores())
+    return trainings, trainings + 2 * SEEDS * MAX_KEPT * STEPS_PER_FIT * on_cpu * min(MICRO_BATCHES, cores())
 
 
 def run_pilot(trial: PilotScene, off: Decisions, on: Decisions, steps: int, seed: int, progress: Progress) -> Pilot:
@@ -176,16 +177,17 @@ def _config(arm: Decisions, steps: int, device: str) -> Config:
     """A small hash-grid field with what stage train would choose."""
     return with_defaults(
         Config(
-            field="grid",
             steps=steps,
             contracted="background" in arm.on,
             view_dependence="view_dependence" in arm.on,
-            backend=chosen_backend(device),
-            chunks=CHUNKS,
-            levels=4,
-            log2_rows=17,
-            finest=256,
-            batch_samples=BATCH_SAMPLES,
+            grid=HashGridOptions(
+                backend=chosen_backend(device),
+                micro_batches=MICRO_BATCHES,
+                num_levels=4,
+                log2_hashmap_size=17,
+                max_res=256,
+                target_samples=TARGET_SAMPLES,
+            ),
         )
     )
 

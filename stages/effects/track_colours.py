@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from nerf import FULL
+from nerf import MIN_SATURATED
 from stages.contract import Progress
 from stages.hardware.device import processors
 from stages.ingest.sharpness import WIDTH
@@ -30,7 +30,7 @@ MIN_WINDOW, MAX_WINDOW = 5, 3.0  # pixels; times the usual window
 # dark beside another one is what lamps and the night look like; it hardly weighs (nerf/effects/statistics/tracks.py:
 # log_noise).
 CLIPPED_SHARE = 0.1
-DARKEST, BRIGHTEST = 3, FULL  # of 255
+DARKEST, BRIGHTEST = 3, MIN_SATURATED  # of 255
 DECODING_BYTES = 2 << 30  # of photos in memory at a time
 
 

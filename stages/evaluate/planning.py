@@ -13,7 +13,7 @@ from stages.evaluate.tiles import PREVIEW_SHARE
 from stages.hardware.device import cores
 from stages.io.files import read_json, read_scene
 from stages.io.photos import spread
-from stages.render.renderer import Allowance, measured_speed
+from stages.render.renderer import TimeBudget, measured_speed
 from stages.train.data import scaled_size, view_rays
 
 if TYPE_CHECKING:
@@ -30,19 +30,19 @@ def affordable_fraction(config: "Config", inputs: Inputs, progress: Progress) ->
     scene, train = read_scene(inputs["normalise"]), inputs["train"]
     if not (test := scene.of_split("test")):
         return 1.0
-    allowance = Allowance(config.seconds, train, other_seconds(len(scene.views), cores()), SHARE, MIN_RENDERING)
+    time_budget = TimeBudget(config.seconds, train, other_seconds(len(scene.views), cores()), SHARE, MIN_RENDERING)
     sizes = [scaled_size(scene.cameras[view.camera], config.downscale) for view in test]
     renders = FITTING_RENDERS if fits_poses(config, read_json(train / "field.json")) else 1
     progress.update("measuring how fast the field renders")
     speed = measured_speed(train, lambda side: _timed_rays(scene, side), max(map(max, sizes)))
     pixels = sum(map(math.prod, sizes))
     whole = pixels * (renders / speed + SECONDS_PER_PIXEL / cores())
-    fraction = _rounded_down(allowance.left() / whole, (renders + PREVIEW_SHARE) / renders)
+    fraction = _rounded_down(time_budget.seconds_left() / whole, (renders + PREVIEW_SHARE) / renders)
     if fraction < 1:
         progress.note(
             "evaluate.some-pixels",
             f"{short_count(speed)} rays/s here: all pixels of {len(test)} test photos take about {duration(whole)}, "
-            f"{allowance.words()}; --evaluate.fraction 1 asks for all",
+            f"{time_budget.message()}; --evaluate.fraction 1 asks for all",
         )
     return fraction
 

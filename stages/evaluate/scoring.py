@@ -155,7 +155,7 @@ class Scorer:
         if image is None:
             camera = self.scene.cameras[view.camera]
             downscale = camera.width / truth.shape[1] / math.sqrt(PREVIEW_SHARE * self.fraction)
-            image = self._renderer(view).draw(view_rays(self.scene, view, downscale)).colour.clamp(0, 1)
+            image = self._renderer(view).render(view_rays(self.scene, view, downscale)).colour.clamp(0, 1)
             truth = resized(truth, *image.shape[:2])
             mask = view_mask(self.ingest, self.scene, view, downscale)
         # The decoded file has an ASCII name that is unique up to its suffix; the photo's own may be anything.
@@ -179,8 +179,8 @@ class Scorer:
     ) -> Rendering:
         """The image (H, W) that ``rays`` see, black and empty but for some ``pixels``, (H, W) bool; None: all."""
         if pixels is None:
-            return renderer.draw(rays, on_chunk)
-        seen = renderer.draw(rays.each(lambda part: part[pixels][None]), on_chunk)
+            return renderer.render(rays, on_chunk)
+        seen = renderer.render(rays.each(lambda part: part[pixels][None]), on_chunk)
         whole = Rendering(torch.zeros(*pixels.shape, 3), torch.zeros(pixels.shape), torch.zeros(pixels.shape))
         for part, values in zip(whole, seen, strict=True):
             part[pixels] = values[0]

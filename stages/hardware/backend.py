@@ -55,7 +55,7 @@ def load_backend(name: BackendName, device: str, progress: Progress | None = Non
 
         return reference
     if why := why_not_warp(device):
-        raise StageError("hardware.no-warp", "cannot use the Warp kernels", why, "Use --train.backend torch.")
+        raise StageError("hardware.no-warp", "cannot use the Warp kernels", why, "Use --train.grid.backend torch.")
     from nerf.kernels import warp as kernels
 
     if progress:
@@ -64,7 +64,10 @@ def load_backend(name: BackendName, device: str, progress: Progress | None = Non
         kernels.compile_kernels(device)
     except OSError as error:
         raise StageError(
-            "hardware.kernel-cache", "cannot use the Warp kernels", _not_kept(error), "Or use --train.backend torch."
+            "hardware.kernel-cache",
+            "cannot use the Warp kernels",
+            _not_kept(error),
+            "Or use --train.grid.backend torch.",
         ) from error
     return kernels
 
@@ -78,7 +81,7 @@ def why_not_warp(device: str) -> str | None:
         if isinstance(error, OSError) and error.filename is not None:  # a library that does not load names none
             return _not_kept(error)
         return f"warp-lang does not load here: {error}"
-    return kernels.why_not(device)
+    return kernels.unavailable_reason(device)
 
 
 def _not_kept(error: OSError) -> str:

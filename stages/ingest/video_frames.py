@@ -1,24 +1,29 @@
 """The frames of a video that become photos: sharp ones, each a step of the camera away from the last.
 
 The video is decoded twice, a frame at a time: first to measure, on frames made small and grey, how far the picture has
-moved and how sharp it is, then to write the chosen ones.
+moved and how sharp it is, then to write the chosen ones. Those of HDR video are tone-mapped by ffmpeg's own filters.
 """
 
 import math
 import os
+import re
+import subprocess
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import cv2
+import imageio_ffmpeg
 import numpy as np
 
 from stages.contract import Progress, StageError
 from stages.ingest.optical_flow import corners, follow_both_ways
 from stages.ingest.panoramas import cutting_advice, is_panorama
 from stages.ingest.sharpness import WIDTH, at_most, sharpness
+from stages.io.ascii_names import shell_quoted
 from stages.io.files import write_jpeg
 
 FLOW_WIDTH = 500  # pixels of the frames on which motion is measured
@@ -40,6 +45,11 @@ MIN_FRAMES = 3  # as sfm needs
 MAX_OVERCOUNT = 2  # frames that a whole video's container may count and not hold
 # Widths over heights of pixels: what is stored for tape has 8/11 to 2; others are wrong, 0 is unknown.
 PIXEL_ASPECTS = (0.25, 4.0)
+# Of HDR video, by ffmpeg's name of its transfer characteristic; both have the primaries of BT.2020 (ITU-R BT.2100).
+# Diffuse white is at 203 cd/m² (ITU-R BT.2408): that becomes about the white of sRGB. What is lighter, up to MAX_NITS,
+# is pressed into the lightest fifth.
+HDR_TRANSFERS = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
+WHITE_NITS, MAX_NITS, LINEAR_UP_TO = 203, 1000, 0.8
 JPEG_QUALITY = 95  # far closer to the frame than the video is to what the camera saw
 
 
@@ -70,6 +80,7 @@ def take_frames(video: Path, most: int, folder: Path, progress: Progress) -> lis
     The frames stand upright and their pixels are square: what the video says of its rotation and of the shape of its
     pixels is undone.
     """
+    transfer = _usable_transfer(video, progress)
     frames = _measure(video, progress)
     chosen = choose_frames(frames, most)
     if len(chosen) < MIN_FRAMES:
@@ -80,7 +91,7 @@ def take_frames(video: Path, most: int, folder: Path, progress: Progress) -> lis
         f"{len(chosen)} of {len(frames)} frames taken: the sharpest of each step of about "
         f"{way / (len(chosen) - 1):.0%} of the picture's width, {way:.1f} widths in all",
     )
-    return list(_write(video, frames, chosen, folder, progress))
+    return list(_write(video, frames, chosen, transfer, folder, progress))
 
 
 def choose_frames(frames: Sequence[Frame], most: int) -> list[int]:
@@ -183,24 +194,93 @@ class _Motion:
 
 
 def _write(
-    video: Path, frames: Sequence[Frame], chosen: Sequence[int], folder: Path, progress: Progress
+    video: Path, frames: Sequence[Frame], chosen: Sequence[int], transfer: str | None, folder: Path, progress: Progress
 ) -> Iterator[TakenFrame]:
-    wanted = set(chosen)
     with _opened(video) as capture:
         stretch = _stretch(capture)
-        for number in range(max(chosen) + 1):
-            if not capture.grab():
-                raise _undecodable("ingest.frame-lost", video, f"frame {number} could be decoded before and cannot now")
-            if number not in wanted:
-                continue
-            frame = _with_square_pixels(capture.retrieve()[1], stretch)
-            picture = cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
-            file = folder / f"{number:06d}"
+        pictures = _as_stored(video, capture, chosen) if transfer is None else _tone_mapped(video, chosen, transfer)
+        for number, stored in zip(chosen, pictures, strict=True):
+            picture, file = _with_square_pixels(stored, stretch), folder / f"{number:06d}"
             write_jpeg(file, picture, JPEG_QUALITY)
             height, width = picture.shape[:2]
             time_s = round(frames[number].time_s - frames[0].time_s, 4)
             yield TakenFrame(number, time_s, frames[number].sharpness, file, width, height)
             progress.update(f"writing the {len(chosen)} frames taken", 0.5 + number / max(chosen) / 2)
+
+
+def _as_stored(video: Path, capture: cv2.VideoCapture, chosen: Sequence[int]) -> Iterator[np.ndarray]:
+    """Frames by their numbers, which rise, as (h, w, 3) uint8 RGB."""
+    wanted = set(chosen)
+    for number in range(max(chosen) + 1):
+        if not capture.grab():
+            raise _lost(video, number)
+        if number in wanted:
+            yield cv2.cvtColor(capture.retrieve()[1], cv2.COLOR_BGR2RGB)
+
+
+def _tone_mapped(video: Path, chosen: Sequence[int], transfer: str) -> Iterator[np.ndarray]:
+    """Frames of HDR video by their numbers, which rise, upright, as (h, w, 3) uint8 sRGB."""
+    select = "+".join(f"eq(n,{number})" for number in chosen)
+    words = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "error", "-i", f"file:{video.resolve()}"]
+    words += ["-vf", f"select='{select}',{tone_mapping(transfer)}", "-fps_mode", "passthrough"]
+    with subprocess.Popen(
+        [*words, "-c:v", "ppm", "-f", "image2pipe", "-"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as ffmpeg:
+        assert ffmpeg.stdout is not None
+        try:
+            for number in chosen:
+                header = [ffmpeg.stdout.readline() for _ in range(3)]  # P6, width and height, 255
+                if not (size := re.fullmatch(rb"(\d+) (\d+)\n", header[1])):
+                    raise _lost(video, number)
+                width, height = map(int, size.groups())
+                if len(pixels := ffmpeg.stdout.read(3 * width * height)) < 3 * width * height:
+                    raise _lost(video, number)
+                yield np.frombuffer(pixels, np.uint8).reshape(height, width, 3)
+        finally:
+            ffmpeg.kill()
+
+
+def tone_mapping(transfer: str) -> str:
+    """The filters by which ffmpeg makes sRGB of HDR video with this transfer characteristic."""
+    return (
+        f"zscale=tin={transfer}:pin=bt2020:min=2020_ncl:t=linear:npl={WHITE_NITS}:agamma=false,format=gbrpf32le,"
+        f"zscale=p=bt709,tonemap=mobius:param={LINEAR_UP_TO}:peak={MAX_NITS / WHITE_NITS:.3f}:desat=0,"
+        "zscale=t=iec61966-2-1:r=pc,format=rgb24"
+    )
+
+
+def _usable_transfer(video: Path, progress: Progress) -> str | None:
+    """The transfer characteristic of HDR video where it can be undone; None of other video. Says what is done."""
+    transfer = hdr_transfer(video)
+    if transfer is None:
+        return None
+    what = f"{video.name} is HDR video ({HDR_TRANSFERS[transfer]})"
+    if can_tone_map():
+        progress.note("ingest.tone-mapped", f"{what}: its frames are tone-mapped to sRGB, white at {WHITE_NITS} cd/m²")
+        return transfer
+    source, filters = shell_quoted(video.name), f'-vf "{tone_mapping(transfer)},format=yuv420p"'
+    progress.note(
+        "ingest.no-tone-mapping",
+        f"{what}, and this ffmpeg has no filters zscale and tonemap: its frames look flat. Convert it first by one "
+        f"that has them: ffmpeg -i {source} {filters} -c:v libx264 -crf 12 sdr.mp4",
+    )
+    return None
+
+
+def hdr_transfer(video: Path) -> str | None:
+    """The transfer characteristic of HDR video, by ffmpeg's name; None of other video, and where it cannot be read."""
+    words = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-i", f"file:{video.resolve()}"]
+    said = subprocess.run(words, capture_output=True).stderr.decode("utf-8", "replace")
+    stream = next((line for line in said.splitlines() if re.match(r" *Stream #.*: Video: ", line)), "")
+    return next((transfer for transfer in HDR_TRANSFERS if re.search(rf"[/ (]{transfer}\b", stream)), None)
+
+
+@cache
+def can_tone_map() -> bool:
+    """Whether this ffmpeg was built with the filters."""
+    words = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-filters"]
+    filters = subprocess.run(words, capture_output=True).stdout.decode("utf-8", "replace")
+    return all(re.search(rf" {name} ", filters) for name in ("zscale", "tonemap"))
 
 
 @contextmanager
@@ -240,6 +320,10 @@ def _undecodable(code: str, video: Path, why: str) -> StageError:
     return StageError(
         code, f"cannot decode the video {video.name}", why, f"Convert it first: ffmpeg -i {video.name} converted.mp4"
     )
+
+
+def _lost(video: Path, number: int) -> StageError:
+    return _undecodable("ingest.frame-lost", video, f"frame {number} could be decoded before and cannot now")
 
 
 def _panoramas(video: Path) -> StageError:

@@ -29,7 +29,7 @@ def save_field(folder: Path, model: RadianceModel, info: dict[str, Any]) -> None
     """
     if not isinstance(model, VanillaNerf | HashGridField):
         raise TypeError(f"no file format for a {type(model).__name__}")
-    kind = {"kind": "paper"}
+    kind = {"kind": "vanilla"}
     if isinstance(model, HashGridField):
         kind = {"kind": "grid", "backend": backend_name(model.backend)}
     weights = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
@@ -81,7 +81,7 @@ def _untrained(
     """The field that ``info`` describes; ``stored`` is the size of its weights in bytes, which it must not exceed.
     Raises ValueError, before anything is allocated."""
     kind, settings = info["kind"], info["settings"]
-    if kind not in ("grid", "paper"):
+    if kind not in ("grid", "vanilla"):
         raise ValueError(f"a field of kind {kind!r} is unknown to this version")
     text, named = json.dumps(settings), settings | {"space": space_map(**settings["space"])}
     if kind == "grid":
@@ -90,9 +90,9 @@ def _untrained(
         _check_size(grid.layout.rows * grid.features_per_level, stored)
         return HashGridField(grid, 0, load_backend(backend_of_field(_trained_with(info), device, progress), device))
     VanillaSettings(**named)
-    paper = TypeAdapter(VanillaSettings).validate_json(text, strict=True)
-    _check_size(paper.depth * paper.width**2, stored)
-    return VanillaNerf(paper, seed=0)
+    vanilla = TypeAdapter(VanillaSettings).validate_json(text, strict=True)
+    _check_size(vanilla.depth * vanilla.width**2, stored)
+    return VanillaNerf(vanilla, seed=0)
 
 
 def _trained_with(info: dict[str, Any]) -> BackendName:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nerf import REGION_HALF
+from nerf import REGION_HALF_SIZE
 from nerf.fields.density_grid import DensityGrid, sample_density_grid
 from nerf.geometry.region_of_interest import CaptureType
 from stages.contract import Inputs, Progress
@@ -74,15 +74,15 @@ def grid_box(capture_type: CaptureType, points: np.ndarray) -> np.ndarray:
     Never a slab where photos were taken around an object: its top may be bare, and points on what it stands on do not
     tell how far it reaches.
     """
-    cube = np.array([[-REGION_HALF] * 3, [REGION_HALF] * 3])
-    points = points[(np.abs(points) <= REGION_HALF).all(axis=1)]
+    cube = np.array([[-REGION_HALF_SIZE] * 3, [REGION_HALF_SIZE] * 3])
+    points = points[(np.abs(points) <= REGION_HALF_SIZE).all(axis=1)]
     if capture_type == "around" or len(points) < MIN_POINTS:
         return cube
     low, high = np.quantile(points, [QUANTILE, 1 - QUANTILE], axis=0)
-    flat, side = int((high - low).argmin()), 2 * REGION_HALF
+    flat, side = int((high - low).argmin()), 2 * REGION_HALF_SIZE
     bottom, top = low[flat] - MARGIN * side, high[flat] + MARGIN * side
     if (high - low).max() >= WIDE * side >= top - bottom:
-        cube[:, flat] = max(bottom, -REGION_HALF), min(top, REGION_HALF)
+        cube[:, flat] = max(bottom, -REGION_HALF_SIZE), min(top, REGION_HALF_SIZE)
     return cube
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerf import REGION_HALF
+from nerf import REGION_HALF_SIZE
 from nerf.geometry.normalisation import Normalisation, normalise
 from nerf.geometry.reconstruction import Reconstruction, angles, extent
 from nerf.geometry.scene import Camera, Scene, Split, View
@@ -240,7 +240,7 @@ def _facts(scene: Scene, found: Normalisation, observations: int) -> dict[str, A
         "up_known": scene.up_known,
         "arc_deg": round(found.arc_deg, 1),
         "share_beyond_region": round(found.beyond, 4) if observations else None,
-        "region_half_sfm": REGION_HALF / scene.scene_from_sfm.scale,
+        "region_half_sfm": REGION_HALF_SIZE / scene.scene_from_sfm.scale,
         "near": min(view.near for view in scene.views),
         "far": max(view.far for view in scene.views),
         "train": len(scene.of_split("train")),

@@ -20,33 +20,45 @@ FLEXIBLE = Flexible(share=0.15, min_seconds=4.0, max_seconds=300.0)
 
 
 class Config(StageConfig):
-    """Settings of stage render. What is None is chosen, so that rendering takes no longer than training did."""
+    """Settings of stage render. Open ones are chosen so that rendering takes less time than training did."""
 
     path: PathKind | None = Field(
         default=None,
-        description="none: orbit around an object, spiral before a scene, interpolated within one or far along it",
+        description="camera path (default: orbit around an object, spiral for a forward-facing capture, "
+        "else interpolated)",
     )
     cameras: Path | None = Field(
         default=None,
-        description="poses and intrinsics instead of a path: a transforms.json in the frame of output/transforms.json, "
-        "or a path.json of ours",
+        description="render the cameras of this file instead of a path: a transforms.json in the frame of "
+        "output/transforms.json, or a path.json of this stage",
     )
-    frames: int | None = Field(default=None, ge=2, description="none: as many as time allows, 24 to 120 if it can be")
+    frames: int | None = Field(
+        default=None, ge=2, description="number of frames (default: as time allows, usually 24 to 120)"
+    )
     width: int | None = Field(
-        default=None, ge=MIN_WIDTH, le=8192, description="pixels; odd numbers are rounded to even ones"
+        default=None,
+        ge=MIN_WIDTH,
+        le=8192,
+        description="width in pixels, rounded to an even number (default: as time allows)",
     )
-    fps: int | None = Field(default=None, ge=1, le=120, description="none: 30, fewer for fewer than 120 frames")
+    fps: int | None = Field(
+        default=None,
+        ge=1,
+        le=120,
+        description="frames per second (default: 30; fewer for a video of fewer than 120 frames)",
+    )
     seconds: float | None = Field(
         default=None,
         gt=0,
-        description="seconds that the stage may take; none: drawing takes 30 % of the training's seconds",
+        description="time limit of the stage (default: rendering takes 30 % of the training time)",
     )
-    depth: bool = Field(default=True, description="write depth.mp4 too")
+    depth: bool = Field(default=True, description="also write depth.mp4")
     match_exposure: str | None = Field(
         default=None,
-        description="name of a photo to render as it was exposed, where photos differ; none: the reference exposure",
+        description="render with the exposure of this photo (its name), if the field models exposure "
+        "(default: the reference exposure)",
     )
-    save_frames: bool = Field(default=False, description="keep every frame as PNG in frames/")
+    save_frames: bool = Field(default=False, description="also save every frame as PNG in frames/")
 
     @field_validator("cameras")
     @classmethod
@@ -57,7 +69,7 @@ class Config(StageConfig):
     @field_validator("width")
     @classmethod
     def _even(cls, width: int | None) -> int | None:
-        """Videos have no odd sides."""
+        """Video codecs need even sides."""
         return width and even_width(width)
 
 
@@ -70,7 +82,7 @@ def expected_seconds(config: Config, workload: Workload) -> float | None:
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
-    """Choose path, frames, width and fps; frames and width by how fast this machine draws pictures along the path."""
+    """Choose path, frames, width and fps; frames and width by how fast this machine renders along the path."""
     from stages.render.video import planned
 
     return planned(config, inputs, progress)
@@ -85,7 +97,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     assert config.width is not None and config.fps is not None
     scene = read_scene(inputs["normalise"])
     renderer = load_renderer(inputs["train"], progress=progress)
-    renderer, appearance = video.as_asked(renderer, config.match_exposure, inputs["train"], scene, progress)
+    renderer, appearance = video.with_appearance(renderer, config.match_exposure, inputs["train"], scene, progress)
     path = video.camera_path(config, scene).resized(config.width)
     video.check_frame_memory(path)
     write_json(folder / "path.json", video.path_json(path, scene, config.fps))
@@ -95,6 +107,6 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     frames_per_second = len(path.cameras) / (time.perf_counter() - started)
     write_json(folder / "speed.json", {"frames_per_second": frames_per_second})
     facts = video.facts(config, path) | ({} if appearance is None else {"appearance": appearance})
-    line = f"{facts['path']}, {facts['frames']} frames {facts['width']}×{facts['height']}"
-    line += "" if appearance is None else f" · {appearance}"
-    return StageResult(outputs, f"{line} · drawn at {frames_per_second:.2g} frames/s", ("speed.json",), facts)
+    summary = f"{facts['path']}, {facts['frames']} frames {facts['width']}×{facts['height']}"
+    summary += "" if appearance is None else f" · {appearance}"
+    return StageResult(outputs, f"{summary} · rendered at {frames_per_second:.2g} frames/s", ("speed.json",), facts)

@@ -1,4 +1,4 @@
-"""Which cameras the video is seen through: a path fitted to the photos, or cameras from a file."""
+"""The cameras of the video: a path along the training photos, or cameras from a file."""
 
 import math
 from collections import Counter
@@ -24,9 +24,9 @@ from stages.sfm.imported.transforms_intrinsics import intrinsics_of, read_intrin
 
 MAX_SIDE = 2**15  # pixels: four times as many as any screen has
 MIN_FOCAL = 0.5  # in widths: a pinhole wider than 90 degrees stretches its corners
-ONE_PLACE = 1e-6  # scene units
-TRIED_FRAMES = 120  # of a path that may be unsuited
-ONE_LENS = 1.1  # between the longest and the shortest focal length of photos that are shown with one
+MIN_CAMERA_EXTENT = 1e-6  # scene units
+TRIAL_FRAMES = 120  # of a path that may be unsuited
+MAX_FOCAL_RATIO = 1.1  # between the longest and the shortest focal length of photos that are shown with one
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class CameraPath:
         """The same views, ``width`` pixels wide; width and height even."""
         return replace(self, cameras=tuple(resized(camera, width) for camera in self.cameras))
 
-    def some(self, frames: Sequence[int]) -> "CameraPath":
+    def select(self, frames: Sequence[int]) -> "CameraPath":
         """Only these frames."""
         return CameraPath(tuple(self.cameras[i] for i in frames), self.poses[list(frames)])
 
@@ -63,44 +63,45 @@ def path_rays(path: CameraPath, scene: Scene) -> Iterator[Rays]:
         yield rays_of_view(ray_directions, pose, float(near[index]), float(far[index]))
 
 
-def usual_path(scene: Scene) -> PathKind:
-    """Around an object an orbit, if it is known about which axis; before a scene a spiral, if the photos look where it
-    looks; along the photos elsewhere, and where an orbit or a spiral would lead through what they do not show to be
+def default_path(scene: Scene) -> PathKind:
+    """An orbit around an object if up is known; a spiral for a forward-facing capture if the photos look where it
+    looks; interpolated otherwise, and where an orbit or a spiral would leave the space that the photos show to be
     free."""
     poses = _poses(scene)
     near = np.array([view.near for view in scene.of_split("train")])
 
-    def clear(path: np.ndarray) -> bool:
+    def is_clear(path: np.ndarray) -> bool:
         return camera_paths.keeps_clear(path, poses, near)
 
-    if scene.capture_type == "around" and scene.up_known and clear(camera_paths.orbit(poses, TRIED_FRAMES)):
+    if scene.capture_type == "around" and scene.up_known and is_clear(camera_paths.orbit(poses, TRIAL_FRAMES)):
         return "orbit"
     spiral = scene.capture_type == "forward" and camera_paths.suits_spiral(poses)
-    if spiral and clear(camera_paths.spiral(poses, TRIED_FRAMES)):
+    if spiral and is_clear(camera_paths.spiral(poses, TRIAL_FRAMES)):
         return "spiral"
     return "interpolated"
 
 
 def _poses(scene: Scene) -> np.ndarray:
-    """Of the training photos, (n, 3, 4); set upright where they face one way: some held sideways would tilt a path."""
+    """Of the training photos, (n, 3, 4); levelled in a forward-facing capture: photos held sideways would tilt the
+    path."""
     poses = np.stack([view.scene_from_camera for view in scene.of_split("train")])
     return levelled(poses) if scene.capture_type == "forward" else poses
 
 
-def fitted_path(scene: Scene, kind: PathKind, frames: int) -> CameraPath:
-    """A path among the training photos, through an undistorted camera of median focal length or, where theirs differ,
-    of one that goes along with them. Raises StageError for an orbit around photos from one place."""
+def make_path(scene: Scene, kind: PathKind, frames: int) -> CameraPath:
+    """A path along the training photos, with an undistorted camera of median focal length or, if focal lengths differ,
+    of those of the photos nearby. Raises StageError for an orbit around photos from one place."""
     path_of = {
         "orbit": camera_paths.orbit,
         "spiral": camera_paths.spiral,
         "interpolated": camera_paths.interpolated,
     }[kind]
     poses = _poses(scene)
-    if kind == "orbit" and np.ptp(poses[:, :, 3], axis=0).max() < ONE_PLACE:
-        hint = "Give --render.path interpolated, or None to have one chosen."
-        raise StageError("render.no-orbit", "there is no orbit to fly", "all photos were taken from one place", hint)
+    if kind == "orbit" and np.ptp(poses[:, :, 3], axis=0).max() < MIN_CAMERA_EXTENT:
+        hint = "Use --render.path interpolated, or None for the default."
+        raise StageError("render.no-orbit", "there is no orbit", "all photos were taken from one place", hint)
     path, camera, relative = path_of(poses, frames), median_camera(scene), _relative_focals(scene)
-    if np.ptp(np.log(relative)) <= math.log(ONE_LENS):
+    if np.ptp(np.log(relative)) <= math.log(MAX_FOCAL_RATIO):
         return CameraPath((camera,) * frames, path)
     focals = camera_paths.zoomed(poses, relative, path)
     return CameraPath(tuple(_pinhole(camera.width, camera.height, focal) for focal in focals), path)

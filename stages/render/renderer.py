@@ -1,4 +1,4 @@
-"""Pictures of a trained field, how fast it draws them here, and how many rays that leaves time for."""
+"""Renders images of a trained field, and measures how many rays per second it renders on this machine."""
 
 import math
 import time
@@ -20,16 +20,16 @@ from stages.hardware.device import compute_device
 from stages.io.field_files import load_field
 from stages.io.files import read_json
 
-SHARE = 0.3  # of the training's seconds that drawing may be expected to take; what is left is room for a busier machine
-MIN_DRAWING = 0.5  # seconds: less draws nothing
+RENDER_FRACTION = 0.3  # of the training time that rendering is expected to take; a busier machine may need more
+MIN_RENDER_SECONDS = 0.5
 TIMED_SECONDS = 0.5
-TIMED_SHARE = 0.05  # of the training's seconds, where that is less
+MAX_TIMED_FRACTION = 0.05  # of the training time
 FIRST_SIDE = 24  # pixels
 
 
 @dataclass(frozen=True)
 class Renderer:
-    """A trained field, where it is computed, and what it is shown over."""
+    """A trained field and the background that it is rendered over."""
 
     model: RadianceModel
     background: Tensor  # (3,), on the model's device
@@ -48,68 +48,73 @@ class Renderer:
         """The field through these effects, on its device, in place of those of new views."""
         return replace(self, model=AppearanceModel(self.field, effects) if effects else self.field)
 
-    def draw(self, rays: Rays, on_chunk: Callable[[float], None] | None = None) -> Rendering:
-        """The picture (height, width) that ``rays`` see, on the CPU. ``on_chunk`` is told the finished share."""
+    def render(self, rays: Rays, on_chunk: Callable[[float], None] | None = None) -> Rendering:
+        """The image (height, width) along ``rays``, on the CPU. ``on_chunk`` gets the finished fraction."""
         device = self.background.device
         on_device = rays.each(lambda part: part.to(device))
         image = render_image(self.model, on_device, self.background, on_chunk=on_chunk)
         return Rendering(*(part.cpu() for part in image))
 
-    def rays_per_second(self, sample: Callable[[int], Rays], largest: int, seconds: float) -> float:
-        """Measured speed. ``sample(side)`` are rays of the pictures to come, reduced to ``side`` pixels; the side
-        grows from FIRST_SIDE to ``largest`` until drawing takes ``seconds``."""
-        side = min(FIRST_SIDE, largest)
-        self.draw(sample(side))  # the first picture pays for memory and kernels
+    def rays_per_second(self, make_rays: Callable[[int], Rays], max_side: int, seconds: float) -> float:
+        """Measured speed. ``make_rays(side)`` gives rays of the images to come, reduced to ``side`` pixels; the side
+        grows from FIRST_SIDE to ``max_side`` until rendering takes ``seconds``."""
+        side = min(FIRST_SIDE, max_side)
+        self.render(make_rays(side))  # the first image allocates memory and compiles kernels
         while True:
-            rays = sample(side)
+            rays = make_rays(side)
             started = time.perf_counter()
-            self.draw(rays)
+            self.render(rays)
             elapsed = time.perf_counter() - started
-            if elapsed >= seconds or side == largest:
+            if elapsed >= seconds or side == max_side:
                 return rays.near.numel() / elapsed
-            side = min(math.ceil(side * math.sqrt(2)), largest)
+            side = min(math.ceil(side * math.sqrt(2)), max_side)
 
 
 def load_renderer(
     train: Path, background: tuple[float, ...] | None = None, progress: Progress | None = None
 ) -> Renderer:
-    """The field that stage train left in ``train``, over ``background``, which a field with a sky does not show; None:
-    what it was trained to stand before. Colour effects are those of new views. ``progress`` is told where the field is
-    computed by torch's kernels alone."""
+    """The field of the finished training in ``train``, over ``background``, which a field with a background model does
+    not show; None: the background of its training. Colour effects are those of new views. ``progress`` gets a note if
+    only torch's kernels run here."""
     device = compute_device()
     model, info = load_field(train, device, progress)
     return Renderer(model, torch.tensor(info["background"] if background is None else background, device=device))
 
 
-class Allowance:
-    """Seconds of drawing for a stage that begins now: what is left of ``seconds`` given to it, less ``beside`` for all
-    else that it does; where none are given a ``share`` of the training's, ``at_least`` so many."""
+class TimeBudget:
+    """The time to render in a stage that begins now: what is left of the ``seconds`` given to it, less
+    ``other_seconds`` for its other work; by default a ``fraction`` of the training time, at least ``min_seconds``."""
 
     def __init__(
-        self, seconds: float | None, train: Path, beside: float, share: float = SHARE, at_least: float = 0.0
+        self,
+        seconds: float | None,
+        train: Path,
+        other_seconds: float,
+        fraction: float = RENDER_FRACTION,
+        min_seconds: float = 0.0,
     ) -> None:
-        self.began, self.given, self.beside = time.perf_counter(), seconds, beside
-        self.trained, self.share, self.at_least = trained_seconds(train), share, at_least
+        self.began, self.given, self.other_seconds = time.perf_counter(), seconds, other_seconds
+        self.trained, self.fraction, self.min_seconds = trained_seconds(train), fraction, min_seconds
 
-    def left(self) -> float:
-        """Seconds that pictures may take."""
+    def seconds_left(self) -> float:
+        """The seconds that rendering may still take."""
         if self.given is None:
-            return max(self.at_least, self.share * self.trained)
-        return max(MIN_DRAWING, self.given - (time.perf_counter() - self.began) - self.beside)
+            return max(self.min_seconds, self.fraction * self.trained)
+        return max(MIN_RENDER_SECONDS, self.given - (time.perf_counter() - self.began) - self.other_seconds)
 
-    def words(self) -> str:
-        """What the choice is held against."""
+    def message(self) -> str:
+        """Where the budget comes from."""
         if self.given is None:
             return f"training took {duration(self.trained)}"
-        return f"given {duration(self.given)}, of which {duration(self.left())} are left for drawing"
+        return f"given {duration(self.given)}, of which {duration(self.seconds_left())} are left for rendering"
 
 
 def trained_seconds(train: Path) -> float:
-    """How long the field in ``train`` was trained, without measuring and saving."""
+    """The training time of the field in ``train``, without evaluation and saving."""
     return read_json(train / "curve.json")["points"][-1]["seconds"]
 
 
-def measured_speed(train: Path, sample: Callable[[int], Rays], largest: int) -> float:
-    """Rays per second that the field in ``train`` draws on this machine, found in no more than a second or two."""
-    seconds = min(TIMED_SECONDS, TIMED_SHARE * trained_seconds(train))
-    return load_renderer(train).rays_per_second(sample, largest, seconds)
+def measured_speed(train: Path, make_rays: Callable[[int], Rays], max_side: int) -> float:
+    """Rays per second that the field in ``train`` renders on this machine, measured within a second or two."""
+    seconds = min(TIMED_SECONDS, MAX_TIMED_FRACTION * trained_seconds(train))
+    return load_renderer(train).rays_per_second(make_rays, max_side, seconds)

@@ -1,4 +1,4 @@
-"""The cameras of a video, how many and how large frames time allows, and the video itself."""
+"""The cameras of a video, the number and size of its frames, and the video itself."""
 
 import difflib
 import time
@@ -21,79 +21,85 @@ from stages.io.files import read_json, read_scene, write_png
 from stages.io.photos import spread
 from stages.io.transforms_export import intrinsics, opengl_matrix
 from stages.io.video import video_writer
-from stages.render.path import CameraPath, fitted_path, path_from_file, path_rays, usual_path
-from stages.render.plan import MIN_FRAMES, SMALL_SIDE, affordable, chosen_fps, longest_side
-from stages.render.renderer import Allowance, Renderer, measured_speed
+from stages.render.path import CameraPath, default_path, make_path, path_from_file, path_rays
+from stages.render.plan import MIN_FRAMES, SMALL_SIDE, choose_frames_and_width, default_fps, max_useful_side
+from stages.render.renderer import Renderer, TimeBudget, measured_speed
 
 if TYPE_CHECKING:
     from stages.render import Config
 
-STARTING_SECONDS = 1.0  # to load the field once more and to write what is not video
-TRIED_VIEWS = 4  # of the path, to see how fast the field draws them
-BYTES_PER_PIXEL = 200  # of a frame while it is drawn and written: rays, colours, depth; 105 to 195 measured
+STARTING_SECONDS = 1.0  # to load the field again and to write the small files
+TIMED_VIEWS = 4  # of the path, to measure how fast the field renders them
+BYTES_PER_PIXEL = 200  # of a frame while it is rendered and written: rays, colours, depth; 105 to 195 measured
 WRITING_SECONDS = 1.5e-7  # to encode a pixel of video.mp4 and of depth.mp4 (x264 with one thread: 13 million a second)
 
 
 def planned(config: "Config", inputs: Inputs, progress: Progress) -> "Config":
-    """Choose path, frames, width and fps; frames and width by how fast this machine draws pictures along the path."""
+    """Choose path, frames, width and fps; frames and width by how fast this machine renders along the path."""
     _check(config)
     scene = read_scene(inputs["normalise"])
     if config.cameras is None:
-        config = config.model_copy(update={"path": config.path or usual_path(scene)})
+        config = config.model_copy(update={"path": config.path or default_path(scene)})
     path = camera_path(config, scene)
     frames = len(path.cameras) if config.cameras else config.frames
     width = config.width
     if frames is None or width is None:
         downscale = 1 if config.cameras else read_json(inputs["train"] / "field.json")["downscale"]
-        allowance = Allowance(config.seconds, inputs["train"], STARTING_SECONDS)
-        frames, width = _affordable(path, scene, inputs["train"], downscale, (frames, width), allowance, progress)
+        time_budget = TimeBudget(config.seconds, inputs["train"], STARTING_SECONDS)
+        frames, width = _choose_frames_and_width(
+            path, scene, inputs["train"], downscale, (frames, width), time_budget, progress
+        )
     kept = None if config.cameras else frames
-    return config.model_copy(update={"frames": kept, "width": width, "fps": config.fps or chosen_fps(frames)})
+    return config.model_copy(update={"frames": kept, "width": width, "fps": config.fps or default_fps(frames)})
 
 
-def _affordable(
+def _choose_frames_and_width(
     path: CameraPath,
     scene: Scene,
     train: Path,
     downscale: float,
-    asked: tuple[int | None, int | None],
-    allowance: Allowance,
+    given: tuple[int | None, int | None],
+    time_budget: TimeBudget,
     progress: Progress,
 ) -> tuple[int, int]:
-    """(frames, width), where not asked for as many and as large as may be drawn in the time allowed."""
+    """(frames, width): as given, or as many and as large as the time budget allows."""
     camera = path.cameras[0]
-    progress.update("trying how fast the field draws")
-    longest = longest_side(camera, downscale)
-    drawn = measured_speed(train, lambda side: _tried_rays(path, scene, side), int(longest))
-    speed = 1 / (1 / drawn + WRITING_SECONDS)
-    frames, width = affordable(allowance.left() * speed, camera, longest, *asked)
-    progress.note("render.size", _why(path.resized(width), frames, speed, allowance, asked))
+    progress.update("measuring rendering speed")
+    longest = max_useful_side(camera, downscale)
+    rendered = measured_speed(train, lambda side: _timed_rays(path, scene, side), int(longest))
+    speed = 1 / (1 / rendered + WRITING_SECONDS)
+    frames, width = choose_frames_and_width(time_budget.seconds_left() * speed, camera, longest, *given)
+    progress.note("render.size", _choice_message(path.resized(width), frames, speed, time_budget, given))
     return frames, width
 
 
-def _tried_rays(path: CameraPath, scene: Scene, side: int) -> Rays:
+def _timed_rays(path: CameraPath, scene: Scene, side: int) -> Rays:
     """Rays of a few frames, reduced to a long side of ``side`` pixels, one above the other."""
     camera = path.cameras[0]
     count = len(path.cameras)
-    few = path.some(sorted(set(spread(count, TRIED_VIEWS))))
+    few = path.select(sorted(set(spread(count, TIMED_VIEWS))))
     width = max(2, 2 * round(side * camera.width / max(camera.width, camera.height) / 2))
     return join_rays(path_rays(few.resized(width), scene))
 
 
-def _why(
-    path: CameraPath, frames: int, rays_per_second: float, allowance: Allowance, asked: tuple[int | None, int | None]
+def _choice_message(
+    path: CameraPath, frames: int, rays_per_second: float, time_budget: TimeBudget, given: tuple[int | None, int | None]
 ) -> str:
-    """What was chosen, how long it takes, and where that is less or more than one would wish."""
+    """What was chosen, how long it takes, and whether that is more time or a smaller video than usual."""
     camera = path.cameras[0]
     seconds = frames * camera.width * camera.height / rays_per_second
-    words = f"{short_count(rays_per_second)} rays/s here: {frames} frames {camera.width}×{camera.height} take about "
-    words += f"{duration(seconds)}, {allowance.words()}"
-    if seconds > (allowance.given or allowance.trained):
-        return f"{words}; that is longer, {'as asked' if any(asked) else 'but there is no smaller video'}"
-    small = (asked[0] is None and frames < MIN_FRAMES) or (
-        asked[1] is None and max(camera.width, camera.height) < SMALL_SIDE - 2
+    size = f"{frames} frames {camera.width}×{camera.height}"
+    message = (
+        f"{short_count(rays_per_second)} rays/s here: {size} take about {duration(seconds)}, {time_budget.message()}"
     )
-    return f"{words}; more would take too long, --render.frames and --render.width ask for it" if small else words
+    if seconds > (time_budget.given or time_budget.trained):
+        return f"{message}; that is longer, {'as requested' if any(given) else 'but there is no smaller video'}"
+    small = (given[0] is None and frames < MIN_FRAMES) or (
+        given[1] is None and max(camera.width, camera.height) < SMALL_SIDE - 2
+    )
+    return (
+        f"{message}; more would take too long: use --render.frames and --render.width to get it" if small else message
+    )
 
 
 def _check(config: "Config") -> None:
@@ -101,17 +107,17 @@ def _check(config: "Config") -> None:
         raise StageError(
             "render.cameras-and-path",
             "--render.cameras excludes --render.path and --render.frames",
-            "the file says where the cameras stand and how many there are",
+            "the file contains all cameras of the video",
             "Leave out one of them.",
         )
 
 
 def check_frame_memory(path: CameraPath) -> None:
-    """Raises StageError where not even one frame can be drawn."""
+    """Raises StageError if there is no memory for a single frame."""
     camera = max(path.cameras, key=lambda camera: camera.width * camera.height)
     size = f"{camera.width}×{camera.height}"
     needed, hint = BYTES_PER_PIXEL * camera.width * camera.height, f"Try --render.width {camera.width // 2}."
-    check_memory(needed, "the video", f"drawing a frame of {size} takes", hint)
+    check_memory(needed, "the video", f"rendering a frame of {size} takes", hint)
 
 
 def camera_path(config: "Config", scene: Scene) -> CameraPath:
@@ -119,7 +125,7 @@ def camera_path(config: "Config", scene: Scene) -> CameraPath:
     if config.cameras is not None:
         return path_from_file(scene, config.cameras)
     assert config.path is not None
-    return fitted_path(scene, config.path, config.frames or MIN_FRAMES)
+    return make_path(scene, config.path, config.frames or MIN_FRAMES)
 
 
 def render_path(path: CameraPath, scene: Scene, renderer: Renderer, progress: Progress) -> Iterator[Rendering]:
@@ -127,24 +133,24 @@ def render_path(path: CameraPath, scene: Scene, renderer: Renderer, progress: Pr
     count, started = len(path.cameras), time.perf_counter()
     for index, rays in enumerate(path_rays(path, scene)):
 
-        def on_chunk(share: float, index: int = index) -> None:
-            done = (index + share) / count
+        def on_chunk(fraction: float, index: int = index) -> None:
+            done = (index + fraction) / count
             left = (time.perf_counter() - started) * (1 - done) / done
             progress.update(f"frame {index + 1} of {count} · {duration(left)} left", done)
 
-        yield renderer.draw(rays, on_chunk)
+        yield renderer.render(rays, on_chunk)
 
 
 def write_videos(renderings: Iterator[Rendering], path: CameraPath, config: "Config", folder: Path) -> list[str]:
-    """Encode frames as they come; depth afterwards, for its colours need the range over the whole video."""
+    """Encode frames as they come; depth afterwards, as its colours need the range over the whole video."""
     assert config.fps is not None
     height, width = path.cameras[0].height, path.cameras[0].width
     if config.save_frames:
         (folder / "frames").mkdir()
-    waiting = folder / "inverse_depth.tmp"
-    # Written and not mapped: on a full disk a write raises OSError, where a mapping would kill the process.
+    temporary = folder / "inverse_depth.tmp"
+    # Not memory-mapped: on a full disk a write raises OSError, where a mapping would kill the process.
     with (
-        waiting.open("wb") if config.depth else nullcontext() as depths,
+        temporary.open("wb") if config.depth else nullcontext() as depths,
         video_writer(folder / "video.mp4", width, height, config.fps) as add,
     ):
         for index, rendering in enumerate(renderings):
@@ -155,9 +161,9 @@ def write_videos(renderings: Iterator[Rendering], path: CameraPath, config: "Con
             if config.save_frames:
                 write_png(folder / "frames" / f"{index:05d}.png", frame)
     if config.depth:
-        inverse = np.memmap(waiting, np.float16, "r", shape=(len(path.cameras), height, width))
+        inverse = np.memmap(temporary, np.float16, "r", shape=(len(path.cameras), height, width))
         _write_depth(inverse, folder / "depth.mp4", config.fps)
-        waiting.unlink()
+        temporary.unlink()
     return ["video.mp4"] + ["depth.mp4"] * config.depth + ["frames"] * config.save_frames
 
 
@@ -186,40 +192,36 @@ def path_json(path: CameraPath, scene: Scene, fps: int) -> dict[str, Any]:
     return (intrinsics(path.cameras[0]) if shared else {}) | {"fps": fps, "frames": frames}
 
 
-def as_asked(
+def with_appearance(
     renderer: Renderer, photo: str | None, train: Path, scene: Scene, progress: Progress
 ) -> tuple[Renderer, str | None]:
-    """What renders the video, and what it shows of the photos' effects; None where there are none.
+    """The renderer of the video, and the appearance that it renders; None without colour effects.
 
-    Training is over when this is found out: a photo of which nothing is known is no error, but what is taken instead is
-    said.
+    A photo without a known appearance is no error, as training is finished by then; a note says what is used instead.
     """
     field = read_json(train / "field.json")
-    words = new_view_words(field)
+    description = new_view_words(field)
     if photo is None:
-        return renderer, words
+        return renderer, description
     if renderer.model is renderer.field:
         progress.note(
-            "render.no-exposure",
-            f"exposure is not modelled: all photos count as exposed alike, and the video like {photo}",
+            "render.no-exposure", f"the field has no exposure model: all photos, and so {photo}, count as exposed alike"
         )
-        return renderer, words
+        return renderer, description
     view = next((view for view in scene.views if view.name == photo), None)
     if view is None:
-        near = difflib.get_close_matches(photo, [view.name for view in scene.views], n=3)
-        progress.note(
-            "render.no-such-photo",
-            f"no photo {photo} has a camera: {words}" + (f"; perhaps {', '.join(near)}" if near else ""),
-        )
-        return renderer, words
+        similar = difflib.get_close_matches(photo, [view.name for view in scene.views], n=3)
+        suggestion = f"; did you mean {' or '.join(similar)}?" if similar else ""
+        progress.note("render.no-such-photo", f"there is no registered photo {photo}: {description}{suggestion}")
+        return renderer, description
     as_photo = renderer.through(new_view_like(photo_effects(field, scene, view, renderer.device)))
     if any(photo in rows for rows in field["effects"].values()):
         return as_photo, f"exposed like {photo}"
     progress.note(
         "render.expected-exposure",
-        f"{photo} was not trained on: its exposure is what the photos taken nearest by let expect",
+        f"{photo} is no training photo: its exposure is estimated from the training photos nearest to it",
     )
-    return as_photo, f"exposed as expected of {photo}"
+    return as_photo, f"exposed as estimated for {photo}"
 
 
 def facts(config: "Config", path: CameraPath) -> dict[str, Any]:

@@ -5,9 +5,7 @@ from typing import Any, NamedTuple, TypeGuard
 
 MAX_DOUBTFUL = 0.05  # fraction of the photos that are excluded, differ from global mapping, or are weakly linked
 MIN_AGREEING = 0.5  # share of the verified pairs
-MIN_GLOBAL_SUPPORT = (
-    0.9  # verified pairs that agree with global mapping where it differs, of those that agree with ours
-)
+MIN_SUPPORT = 0.9  # share of the pairs that agree with our poses must agree with the other mapping's, to cast doubt
 MAX_SHOWN = 8  # photos of a group
 MIN_SHOWN = 0.0001  # share of the extent: 0.00% would be no figure
 MAX_WEAK = 4  # weakly linked groups shown one by one
@@ -78,6 +76,9 @@ def _doubts_of_check(registration: Mapping[str, Any]) -> list[str]:
         return found
     if check["agreeing"] < MIN_AGREEING * check["pairs"]:
         found.append(f"only {check['agreeing']:,} of {check['pairs']:,} verified image pairs agree with them")
+    if not check["fits"] and registration["source"] != "import":
+        noise = f"{check['error_px'] / check['noise_px']:.0f} times their noise"
+        found.append(f"verified matches are {check['error_px']:.1f} px from where they should be, {noise}")
     if len(breaks := _sequence_breaks(registration)) > MAX_DOUBTFUL * photos:
         found.append(f"{len(breaks)} times the matches of two photos taken one after the other contradict their poses")
     links = _weak_links(registration)
@@ -102,7 +103,8 @@ def _sequence_breaks(registration: Mapping[str, Any]) -> list[tuple[str, str]]:
 def _doubts_of_global_mapping(comparison: Mapping[str, Any] | None) -> list[str]:
     if not _disagrees(comparison):
         return []
-    return [f"global mapping places {len(comparison['different'])} of {comparison['photos']} photos differently"]
+    different = f"{len(comparison['different'])} of {comparison['photos']} photos"
+    return [f"incremental and global mapping give {different} different poses"]
 
 
 def _disagrees(comparison: Mapping[str, Any] | None) -> TypeGuard[Mapping[str, Any]]:
@@ -116,8 +118,9 @@ def _differs(comparison: Mapping[str, Any] | None) -> TypeGuard[Mapping[str, Any
 
 
 def _is_refuted(comparison: Mapping[str, Any]) -> bool:
-    """Whether clearly more verified pairs of the photos in question agree with the cameras than with global mapping."""
-    return comparison["agreeing_global"] < MIN_GLOBAL_SUPPORT * comparison["agreeing"]
+    """Whether clearly more verified pairs of the photos in question agree with the cameras than with those of the
+    mapping that was not taken."""
+    return comparison["agreeing_other"] < MIN_SUPPORT * comparison["agreeing"]
 
 
 def _doubts_of_structure(repeated: Mapping[str, Any] | None) -> list[str]:
@@ -151,8 +154,9 @@ def _figures(registration: Mapping[str, Any]) -> str | None:
         pairs = f"{check['agreeing']:,} of {check['pairs']:,} verified image pairs"
         said.append(f"the cameras agree with {pairs} (median error {check['error_px']:.2f} px)")
     if _differs(comparison) and _is_refuted(comparison):
-        support = f"{comparison['agreeing_global']:,} verified image pairs agree with it and {comparison['agreeing']:,}"
-        said.append(f"global mapping gives {_photos(len(comparison['different']))} other poses; {support} with these")
+        name = "incremental" if comparison["taken"] else "global"
+        support = f"{comparison['agreeing_other']:,} of their image pairs agree with it and {comparison['agreeing']:,}"
+        said.append(f"{name} mapping gives {_photos(len(comparison['different']))} other poses; {support} with these")
     elif comparison and not comparison["failed"] and comparison["centre"] is not None:
         same = f"{comparison['agree']} of {comparison['photos']} photos the same pose"
         extent = f"{max(comparison['centre'], MIN_SHOWN):.2%} of the extent"
@@ -169,7 +173,10 @@ def _groups(registration: Mapping[str, Any]) -> list[PhotoGroup]:
     breaks = [first for first, _ in _sequence_breaks(registration)]
     groups.append(("Their matches with the next photo by name or time contradict their poses", breaks))
     groups.append(
-        ("Global mapping gives these different poses", comparison["different"] if _disagrees(comparison) else [])
+        (
+            "Incremental and global mapping give these different poses",
+            comparison["different"] if _disagrees(comparison) else [],
+        )
     )
     groups.append(("Excluded for repeated structure: these fit only …", repeated.get("others", [])))
     groups.append(("… if these have other poses", repeated.get("photos", [])))

@@ -12,7 +12,6 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
-from tyro.conf import Suppress
 
 from nerf.geometry.scene import Scene
 from stages.amounts import duration, short_count
@@ -33,9 +32,9 @@ from stages.report.cameras import (
 )
 from stages.report.effects import effects_table
 from stages.report.plots import ORDER_COLOURS, Score, camera_svgs, curve_svg
-from stages.report.profile import parts_bar
+from stages.report.profile import profile_bar
 from stages.tradeoff.plots import COLUMNS, plot_svg, rendering_sentence, table_cells
-from stages.train.curve import coming_doubling, doubling_words, knee_words, more_option, ssim_words
+from stages.train.curve import diminishing_returns_message, doubling_message, more_option, predicted_gain, ssim_message
 
 if TYPE_CHECKING:
     from stages.report import Config
@@ -60,7 +59,7 @@ class Results:
     effects: dict[str, Any] | None
     field: dict[str, Any] | None
     curve: dict[str, Any] | None
-    parts: dict[str, Any] | None
+    profile: dict[str, Any] | None
     metrics: dict[str, Any] | None
     study: dict[str, Any] | None
 
@@ -81,7 +80,7 @@ def read_results(inputs: Inputs, stages: Sequence[str]) -> Results:
         effects=of("effects", "effects.json"),
         field=of("train", "field.json"),
         curve=of("train", "curve.json"),
-        parts=of("train", "profile.json")
+        profile=of("train", "profile.json")
         if "train" in inputs and (inputs["train"] / "profile.json").exists()
         else None,
         metrics=of("evaluate", "metrics.json"),
@@ -105,7 +104,7 @@ def summarise(results: Results) -> dict[str, Any]:
         "total_seconds": round(train.get("earlier_seconds", 0.0) + sum(m["seconds"] for m in manifests.values()), 3),
         "stage_seconds": {stage: manifest["seconds"] for stage, manifest in manifests.items()},
         "expected_seconds": _expected(manifests),
-        "training_parts": results.parts,
+        "training_profile": results.profile,
         **{key: metrics.get(key) for key in ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")},
         "scored_fraction": metrics.get("fraction"),
         "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
@@ -147,7 +146,7 @@ def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
         **_cameras_part(results, names),
         effects=effects_table(results.effects),
         curve=_curve(results),
-        parts=parts_bar(results.parts),
+        profile=profile_bar(results.profile),
         metrics=results.metrics,
         scored_on=scored_on(results.metrics) if results.metrics and results.metrics["images"] else None,
         compared=_compared(results),
@@ -198,12 +197,14 @@ def _run_part(results: Results, summary: dict[str, Any], config: "Config") -> di
 
 def _settings(manifests: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """Every option that has a flag, by its flag, in the order of the stages."""
-    return {
-        f"--{stage}.{name.replace('_', '-')}": manifests[stage]["config"].get(name)
-        for stage in manifests
-        for name, field in sorted(import_module(f"stages.{stage}").Config.model_fields.items())
-        if Suppress not in field.metadata
-    }
+    settings = {}
+    for stage in manifests:
+        for name, _ in sorted(import_module(f"stages.{stage}").Config.flags()):
+            *group, option = name.split(".")
+            values = manifests[stage]["config"]
+            if (table := values.get(group[0]) if group else values) is not None:
+                settings[f"--{stage}.{name.replace('_', '-')}"] = table.get(option)
+    return settings
 
 
 def _workspace(inputs: Inputs) -> str:
@@ -267,13 +268,13 @@ def _curve(results: Results) -> dict[str, Any] | None:
         return None
     points, metrics = results.curve["points"], results.metrics or {}
     baselines = {"nearest training view": "psnr_nearest_view", "mean image": "psnr_mean_image"}
-    coming = coming_doubling(results.curve["field"], results.curve["whole"], points)
+    coming = predicted_gain(results.curve["field"], results.curve["single_cycle"], points)
     scored = metrics.get("psnr") is not None
     score = Score(metrics["psnr"], metrics["psnr_interval"]) if scored else None
     svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming, score)
     if svg is None:
         return None
-    words = [doubling_words(points, coming), knee_words(points), ssim_words(points)]
+    words = [doubling_message(points, coming), diminishing_returns_message(points), ssim_message(points)]
     threads = results.curve["threads"]
     where = "a GPU" if results.curve["device"] == "cuda" else f"{threads} processor core{'' if threads == 1 else 's'}"
     sentences = [f"{word[0].upper()}{word[1:]}." for word in words if word]

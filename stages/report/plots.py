@@ -12,9 +12,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.patches import Rectangle
 
-from nerf import REGION_HALF
+from nerf import REGION_HALF_SIZE
 from nerf.geometry.scene import Scene, View
-from nerf.training.learning_curve import Gain, knee, quality_at
+from nerf.training.learning_curve import PredictedGain, diminishing_returns_seconds, quality_at
 from stages.amounts import duration
 from stages.io.figures import INK, svg_element, svg_figure
 from stages.sfm.pairs.match_graph import natural_order
@@ -37,12 +37,12 @@ class Score(NamedTuple):
 def curve_svg(
     points: Sequence[dict[str, Any]],
     baselines: dict[str, float | None],
-    coming: Gain | None = None,
+    coming: PredictedGain | None = None,
     score: Score | None = None,
 ) -> str | None:
-    """PSNR against training seconds, one grid line per doubling of the time, with the knee and what is ``coming``, what
-    the next doubling is predicted to buy; None for fewer than two points. ``baselines`` are drawn as horizontal lines
-    under their names, the ``score`` of the finished field at the end of the curve.
+    """PSNR against training seconds, one grid line per doubling of the time, with the start of diminishing returns and
+    the ``coming`` gain that the next doubling is predicted to bring; None for fewer than two points. ``baselines`` are
+    drawn as horizontal lines under their names, the ``score`` of the finished field at the end of the curve.
     """
     rows = [row for row in points if row["seconds"] > 0]
     if len(rows) < 2:
@@ -56,7 +56,7 @@ def curve_svg(
         if coming is not None:
             _draw_prediction(axes, rows, coming)
         last = rows[-1]["seconds"] * (1 if coming is None else 2)
-        _draw_knee(axes, probe_curve(rows))
+        _draw_diminishing_returns(axes, probe_curve(rows))
         if score is not None:
             _draw_score(axes, rows[-1]["seconds"], score)
         # Last, for they fix the limits, beyond which nothing is seen.
@@ -67,7 +67,7 @@ def curve_svg(
         return svg_element(figure)
 
 
-def _draw_prediction(axes: Axes, rows: Sequence[dict[str, Any]], coming: Gain) -> None:
+def _draw_prediction(axes: Axes, rows: Sequence[dict[str, Any]], coming: PredictedGain) -> None:
     """A dotted line on to twice the time, with its interval."""
     (seconds, psnr), style = probe_curve(rows)[-1], {"color": BLUE, "lw": 1.5, "ls": (0, (1, 1.5))}
     axes.plot([seconds, 2 * seconds], [psnr, psnr + coming.db], label="predicted", **style)
@@ -81,10 +81,10 @@ def _draw_score(axes: Axes, seconds: float, score: Score) -> None:
     axes.errorbar(seconds, score.psnr, [[score.psnr - low], [high - score.psnr]], label="score, test photos", **style)
 
 
-def _draw_knee(axes: Axes, curve: Sequence[tuple[float, float]]) -> None:
-    if (seconds := knee(curve)) is not None:
+def _draw_diminishing_returns(axes: Axes, curve: Sequence[tuple[float, float]]) -> None:
+    if (seconds := diminishing_returns_seconds(curve)) is not None:
         ring = {"color": "none", "mec": ORANGE, "ms": 11, "mew": 2}
-        axes.plot(seconds, quality_at(curve, seconds), "o", label=f"knee, {duration(seconds)}", **ring)
+        axes.plot(seconds, quality_at(curve, seconds), "o", label=f"diminishing returns, {duration(seconds)}", **ring)
 
 
 def _draw_baselines(axes: Axes, baselines: dict[str, float]) -> None:
@@ -122,7 +122,7 @@ def _layout_svg(
 ) -> str:
     """One projection, on the two given axes of the scene. Points beyond the cameras and the box are cut off."""
     centres = np.array([view.scene_from_camera[:, 3] for view in views])[:, plane]
-    low, high = np.minimum(centres.min(0), -REGION_HALF), np.maximum(centres.max(0), REGION_HALF)
+    low, high = np.minimum(centres.min(0), -REGION_HALF_SIZE), np.maximum(centres.max(0), REGION_HALF_SIZE)
     middle, half = (low + high) / 2, (high - low) / 2 + 0.06 * (high - low).max()
     xyz, rgb = points
     shown = np.linspace(0, len(xyz) - 1, min(len(xyz), MAX_POINTS)).astype(int)
@@ -131,7 +131,13 @@ def _layout_svg(
         axes.scatter(*xyz[shown][:, plane].T, c=rgb[shown] / 255, s=2, lw=0, alpha=0.7, rasterized=True)
         axes.add_patch(
             Rectangle(
-                (-REGION_HALF, -REGION_HALF), 2 * REGION_HALF, 2 * REGION_HALF, fill=False, ec=INK, ls="--", alpha=0.6
+                (-REGION_HALF_SIZE, -REGION_HALF_SIZE),
+                2 * REGION_HALF_SIZE,
+                2 * REGION_HALF_SIZE,
+                fill=False,
+                ec=INK,
+                ls="--",
+                alpha=0.6,
             )
         )
         _draw_cameras(axes, scene, views, plane, 0.1 * half.max(), joined)

@@ -31,6 +31,10 @@ MIN_RELATIVE_DEPTH = 1e-3  # of its distance to the other photo: nearer a point 
 MAX_RECHECKS = 12  # of misplaced photos; being cleared goes on from neighbour to neighbour
 MIN_LINK_MATCHES = 60  # agreeing matches across a cut: twice what mapping asks of a single photo
 MIN_MATCHES_FOR_MEDIAN = 8  # of a pair
+# The median error under right poses is 1.2 to 2.9 times the noise of the matches, with the camera model of mapping too
+# (docs/experiments/match_graph.md); where it is this many times, and more than MIN_TOLERANCE_PX allows in any case, the
+# poses as a whole are wrong. Then every pair is a little wrong, and none is worse than the others.
+MAX_NOISE_MULTIPLE = 4.0
 # So many pairs of consecutive photos, and such a fraction of them, may contradict the poses with at least
 # MIN_STEP_STRENGTH of the matches that consecutive photos have in the median.
 MAX_BROKEN_STEPS, MAX_BROKEN_FRACTION, MIN_STEP_STRENGTH = 2, 0.05, 0.5
@@ -41,7 +45,8 @@ class PairMatches(NamedTuple):
 
     Keypoints are numbered through all photos: ``photo`` says whose each is, ``ray_direction`` is its unit ray in the
     camera's frame (right for every camera model). ``focal_px`` turns angles into pixels, one per photo. ``weight`` is
-    how many verified matches a pair has in all; those listed may be a sample.
+    how many verified matches a pair has in all; those listed may be a sample. ``noise_px`` is their usual distance from
+    the epipolar geometry of their two photos alone, which no pose of a model bends; NaN where it is not known.
     """
 
     pairs: Int[np.ndarray, "pairs 2"]
@@ -51,6 +56,7 @@ class PairMatches(NamedTuple):
     photo: Int[np.ndarray, "keypoints"]
     ray_direction: Float[np.ndarray, "keypoints 3"]
     focal_px: Float[np.ndarray, "photos"]
+    noise_px: float = np.nan
 
 
 def transfer_errors_px(
@@ -164,7 +170,9 @@ class PoseCheck(NamedTuple):
         return ~(self.misplaced | self.unlinked)
 
 
-def check_poses(matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"]) -> PoseCheck:
+def check_poses(
+    matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"], max_tolerance_px: float = MAX_TOLERANCE_PX
+) -> PoseCheck:
     """Classify photos and groups by the votes of the pairs between them and the rest.
 
     The groups are the sides of weak cuts of the graph of agreeing pairs: a group that was moved as a whole agrees
@@ -172,9 +180,10 @@ def check_poses(matches: PairMatches, world_from_camera: Float[np.ndarray, "phot
     """
     count, nowhere = len(world_from_camera), np.zeros(len(matches.pairs), bool)
     error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, nowhere))
-    misplaced = _misplaced(*_votes(matches, error, _tolerance_px(error, matches.weight)[1], count))
+    _, tolerance = _tolerance_px(error, matches.weight, max_tolerance_px)
+    misplaced = _misplaced(*_votes(matches, error, tolerance, count))
     error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, _trusted(matches, misplaced)))
-    median, tolerance = _tolerance_px(error, matches.weight)
+    median, tolerance = _tolerance_px(error, matches.weight, max_tolerance_px)
     support, against = _votes(matches, error, tolerance, count)
     misplaced = _misplaced(support, against)
     # Depths that a misplaced group got wrong count against good photos beside it: these are checked again without.
@@ -209,6 +218,13 @@ def _trusted(matches: PairMatches, misplaced: Bool[np.ndarray, "photos"]) -> Boo
     return ~misplaced[matches.pairs].any(axis=1) & (matches.weight >= MIN_PAIR_MATCHES)
 
 
+def fits_as_a_whole(matches: PairMatches, check: PoseCheck) -> bool:
+    """Whether the matches are about as near to where the poses predict them as to the epipolar geometry of their two
+    photos alone. True where that is not known."""
+    exact_enough = check.median_px <= MIN_TOLERANCE_PX / TOLERANCE_FACTOR
+    return exact_enough or not check.median_px > MAX_NOISE_MULTIPLE * matches.noise_px
+
+
 def agreement(matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"]) -> tuple[int, int]:
     """How many pairs agree with poses, and how many agree with or contradict them."""
     error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera))
@@ -217,11 +233,13 @@ def agreement(matches: PairMatches, world_from_camera: Float[np.ndarray, "photos
     return agreeing, agreeing + int(_contradicts(matches, error, tolerance).sum())
 
 
-def _tolerance_px(error_px: Float[np.ndarray, "pairs"], weight: Float[np.ndarray, "pairs"]) -> tuple[float, float]:
+def _tolerance_px(
+    error_px: Float[np.ndarray, "pairs"], weight: Float[np.ndarray, "pairs"], most_px: float = MAX_TOLERANCE_PX
+) -> tuple[float, float]:
     """The median error of matches, and up to which one a pair agrees."""
     known = np.isfinite(error_px)
     median = float(np.median(np.repeat(error_px[known], weight[known].astype(int)))) if known.any() else 0.0
-    return median, float(np.clip(TOLERANCE_FACTOR * median, MIN_TOLERANCE_PX, MAX_TOLERANCE_PX))
+    return median, float(np.clip(TOLERANCE_FACTOR * median, MIN_TOLERANCE_PX, most_px))
 
 
 def consistent_matches(

@@ -102,9 +102,9 @@ class JobState:
         return image_similarity(self.database, len(self.photos), self.job.seed)
 
     def missing(self) -> list[int]:
-        """The photos that are not registered in the best model so far."""
+        """The photos that are not registered in the best model so far; all where it does not fit its matches."""
         best = self.usable()
-        registered = set(best.groups[0]) if best else set()
+        registered = set(best.groups[0]) if best and best.fits else set()
         return [number for number, file in enumerate(self.files) if file not in registered]
 
     def sibling(self, name: str) -> Path:

@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 
 from stages.contract import Note
 from stages.sfm import global_mapping
-from stages.sfm.colmap.diagnosis import compare_models
+from stages.sfm.colmap.diagnosis import compare_models, disagree
 from stages.sfm.colmap.mapping import incremental_options, map_globally, map_incrementally
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import (
     Checked,
     agreeing_pairs,
+    better,
     check_model,
     copy_consistent_matches,
     deregister,
@@ -28,12 +29,13 @@ from stages.sfm.retry_strategies import STRATEGIES, MappingOptions, Strategy
 
 
 class CheckedModel(NamedTuple):
-    """The model with only the images that passed the check, by name why others are excluded, and whether the sequence
-    of photos was broken in it."""
+    """The model with only the images that passed the check, by name why others are excluded, whether the sequence of
+    photos was broken in it, and whether it fits the matches as a whole."""
 
     model: Any
     excluded: dict[str, str]
     sequence_broken: bool
+    fits: bool
 
 
 def run_mapping(
@@ -57,7 +59,7 @@ def run_mapping(
             matches, state.images, models, options, lambda: state.send(phase="mapping", done=next(registered))
         )
     shutil.rmtree(models)
-    checked = CheckedModel(None, {}, False)
+    checked = CheckedModel(None, {}, False, False)
     failure = global_mapping.failure(beside) if beside else None
     other = load_native(beside.folder) if beside and not failure else None
     compared = None if beside is None else {"failed": failure}
@@ -68,17 +70,20 @@ def run_mapping(
         checked = _checked(before, other, database, matches, options, state)
         found[0] = checked.model
         if other is not None:  # where it was taken itself, it is compared with the one that it replaced
-            compared = _comparison(before if found[0] is other else found[0], other, database, state)
+            rejected = before if found[0] is other else other
+            compared = _comparison(found[0], rejected, database, state) | {"taken": found[0] is other}
     state.end("mapping")
     return found, checked, compared
 
 
 def _comparison(model: Any, other: Any, database: Path, state: JobState) -> dict[str, Any]:
-    """How the model of global mapping compares, and where it differs, how many verified pairs agree with either."""
-    compared = compare_models(model, other)
-    files, seed = set[str](compared["different"]), state.job.seed
-    support = [agreeing_pairs(one, database, seed, files) if files else None for one in (model, other)]
-    return compared | {"failed": None, "agreeing": support[0], "agreeing_global": support[1]}
+    """How the models of incremental and global mapping compare, the one that was taken first; and where they differ,
+    how many verified pairs agree with either."""
+    compared = compare_models(model, other) | {"failed": None, "agreeing": None, "agreeing_other": None}
+    if compared["different"]:
+        taken, rejected = ((one, check_model(one, database, state.job.seed)) for one in (model, other))
+        compared["agreeing"], compared["agreeing_other"] = agreeing_pairs(taken, rejected, compared["different"])
+    return compared
 
 
 def _start_global_mapping(strategy: Strategy, database: Path, state: JobState) -> "global_mapping.Started | None":
@@ -91,26 +96,34 @@ def _start_global_mapping(strategy: Strategy, database: Path, state: JobState) -
 
 def _checked(model: Any, other: Any, database: Path, matches: Path, options: Any, state: JobState) -> CheckedModel:
     """The model without the images that fail the check. These are registered again first, in the model of global
-    mapping where more images pass in it."""
+    mapping where that fits the verified matches better."""
     best, sequence = (model, check_model(model, database, state.job.seed)), capture_sequence(database, state)
-    if (failed := best[1].failed()) and not fragments_sequence(best[1], sequence):
-        what = "contradict their verified matches" if best[1].check.misplaced.any() else "are not linked to the others"
-        state.send(
-            note=Note(
-                "sfm.registered-again",
-                f"{len(failed)} of {len(best[1].ids)} registered photos {what}: registering them again",
+    if not fragments_sequence(best[1], sequence):
+        if other is not None and (best[1].failed() or disagree(model, other)):
+            best = better(best, (other, check_model(other, database, state.job.seed)))
+            if best[0] is other:
+                state.send(
+                    note=Note(
+                        "sfm.global-mapping",
+                        "verified matches agree better with global than with incremental mapping: it is taken",
+                    )
+                )
+        if failed := best[1].failed():
+            misplaced = best[1].check.misplaced.any()
+            what = "contradict their verified matches" if misplaced else "are not linked to the others"
+            state.send(
+                note=Note(
+                    "sfm.registered-again",
+                    f"{len(failed)} of {len(best[1].ids)} registered photos {what}: registering them again",
+                )
             )
-        )
-        if other is not None:
-            best = max(best, (other, check_model(other, database, state.job.seed)), key=_passing)
-        if best[1].failed():
             again = register_again(*best, matches, state.images, Path(state.job.folder, "again"), options)
             best = max(best, (again, check_model(again, database, state.job.seed)), key=_passing)
     model, checked = best
     why = reasons(model, checked)
     deregister(model, checked.failed())
     outside = drop_outside_main_segment(model, checked, sequence)
-    return CheckedModel(model, why | outside, bool(outside))
+    return CheckedModel(model, why | outside, bool(outside), checked.fits)
 
 
 def _passing(candidate: tuple[Any, Checked]) -> int:

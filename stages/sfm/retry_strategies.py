@@ -77,8 +77,8 @@ class Outcome:
 
     ``database`` is its file name, ``groups`` the files in each sub-model, best first. Of the best one: number of
     ``points``, mean error, another sub-model that contradicts it (``conflict``), by file why images were ``excluded``,
-    whether the sequence of photos is broken in it (``sequence_broken``), and its comparison with ``global_mapping``.
-    ``seconds`` are those of each phase.
+    whether the sequence of photos is broken in it (``sequence_broken``), whether it fits its verified matches as a
+    whole (``fits``), and its comparison with ``global_mapping``. ``seconds`` are those of each phase.
     """
 
     name: str
@@ -91,12 +91,15 @@ class Outcome:
     match_graph: dict[str, Any] | None = None
     excluded: dict[str, str] = field(default_factory=dict)
     sequence_broken: bool = False
+    fits: bool = True
     global_mapping: dict[str, Any] | None = None
 
     @property
-    def rank(self) -> tuple[int, int, float]:
-        """Greater is better: more registered images, then more points, then a smaller error."""
-        return (len(self.groups[0]), self.points, -(self.reprojection_px or 0.0)) if self.groups else (0, 0, 0.0)
+    def rank(self) -> tuple[bool, int, int, float]:
+        """Greater is better: one that fits, then more registered images, then more points, then a smaller error."""
+        if not self.groups:
+            return (False, 0, 0, 0.0)
+        return (self.fits, len(self.groups[0]), self.points, -(self.reprojection_px or 0.0))
 
 
 class StrategyLog:
@@ -194,7 +197,7 @@ class Situation(NamedTuple):
     ``missing`` of ``images`` are unregistered, and ``alone`` of these are in no other sub-model either. ``linked``:
     their matches with registered images, or with each other if none is registered, are enough to register one.
     ``planar``: there is no model, and nearly all pairs are planar or pure rotations. ``sequence_broken``: the sequence
-    of photos is broken in a model.
+    of photos is broken in a model. ``misfit``: the best model does not fit its matches, so all images count as missing.
     """
 
     missing: int
@@ -204,6 +207,7 @@ class Situation(NamedTuple):
     planar: bool
     camera_model_is_given: bool
     sequence_broken: bool = False
+    misfit: bool = False
 
 
 def reason_against(strategy: Strategy, now: Situation) -> str | None:
@@ -212,6 +216,8 @@ def reason_against(strategy: Strategy, now: Situation) -> str | None:
         return "the photos tell nothing of depth"
     if now.sequence_broken and strategy.matches != "consecutive":
         return "the scene has repeated structure, which these do not mend"
+    if now.misfit and strategy.matches in ("relaxed", "more features"):
+        return "there are matches enough, and the cameras do not fit them"
     if strategy.matches == "same" and not now.linked:
         return "the missing photos share too few matches with the others"
     if strategy.matches == "fisheye" and now.camera_model_is_given:

@@ -134,8 +134,10 @@ def _try_strategies(state: JobState) -> None:
             log.skipped[strategy.name] = why
         else:
             are = "is" if len(missing) == 1 else "are"
-            count = f"{len(missing)} of {len(state.photos)} photos {are} not registered yet"
-            state.send(note=Note("sfm.strategy", f"{count}: {strategy.description}"))
+            why = f"{len(missing)} of {len(state.photos)} photos {are} not registered yet"
+            if _is_misfit(state):
+                why = "the cameras do not fit the verified matches"
+            state.send(note=Note("sfm.strategy", f"{why}: {strategy.description}"))
             _try(strategy, missing, state)
     for why, descriptions in unsaid.items():
         state.send(note=Note("sfm.strategy-useless", f"skipped, because {why}: {'; '.join(descriptions)}"))
@@ -143,13 +145,20 @@ def _try_strategies(state: JobState) -> None:
 
 def _why_useless(strategy: Strategy, missing: list[int], state: JobState) -> str | None:
     """Why the strategy cannot help, None if it can."""
-    groups = best.groups if (best := state.usable()) else [[]]
+    misfit = _is_misfit(state)
+    groups = best.groups if (best := state.usable()) and not misfit else [[]]
     linked, planar = links(state.latest(), set(groups[0]))
     alone = {state.files[number] for number in missing}.difference(*groups)
     count, given = len(state.photos), state.job.camera_model is not None
     planar &= len(missing) == count
-    now = Situation(len(missing), len(alone), count, linked, planar, given, _sequence_broken(state))
+    now = Situation(len(missing), len(alone), count, linked, planar, given, _sequence_broken(state), misfit)
     return reason_against(strategy, now)
+
+
+def _is_misfit(state: JobState) -> bool:
+    """Whether even the best model does not fit its verified matches."""
+    best = state.usable()
+    return best is not None and not best.fits
 
 
 def _sequence_broken(state: JobState) -> bool:
@@ -193,6 +202,7 @@ def _try(strategy: Strategy, missing: list[int], state: JobState) -> None:
             conflict=find_conflict(models),
             excluded=checked.excluded,
             sequence_broken=checked.sequence_broken,
+            fits=checked.fits,
             global_mapping=compared,
         )
     state.log.add(outcome)

@@ -228,7 +228,7 @@ def _renderer(field: Path, benchmark: Benchmark) -> Callable[[Crop], Tensor]:
 
     def render(crop: Crop) -> Tensor:
         effects = photo_effects(info, benchmark.scene, views[crop.photo], renderer.device)
-        return renderer.through(effects).draw(crop.rays).colour.clamp(0, 1)
+        return renderer.through(effects).render(crop.rays).colour.clamp(0, 1)
 
     return render
 

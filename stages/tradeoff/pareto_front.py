@@ -17,10 +17,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from statistics import mean, stdev
-from typing import Any, Literal
+from typing import Any
 
 from stages.amounts import duration, resolution_name
-from stages.tradeoff.schedule import WORKSPACE_FIELD, Run, family_of, field_of
+from stages.tradeoff.schedule import WORKSPACE_FIELD, Run, family_of, field_name
+from stages.train.config import FieldName
 
 MIN_GAIN_DB = 0.5  # a doubling of the time that buys less is not worth it; 0.5 dB is what one sees side by side
 MIN_DEGREES_OF_FREEDOM = 3
@@ -35,7 +36,7 @@ class Point:
     None where no setting has several seeds. ``peak_memory_mb`` is the most of any, None for the workspace's."""
 
     variant: str
-    field: Literal["grid", "paper"]
+    field: FieldName
     downscale: float
     steps: int
     seeds: int
@@ -91,7 +92,7 @@ def _point(variant: str, downscale: float, steps: int, group: Sequence[Mapping[s
     similarities = [figures["ssim"] for figures in group if figures["ssim"] is not None]
     return Point(
         variant=variant,
-        field=field_of(variant),
+        field=field_name(variant),
         downscale=downscale,
         steps=steps,
         seeds=len(group),

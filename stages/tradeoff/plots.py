@@ -19,9 +19,9 @@ COLUMNS = ("", "field", "photos", "steps", "training", "a frame", "peak memory",
 FAMILIES = {
     "grid": ("o", "#0072b2", "feature grid (small, middle, large)"),
     "grid samples": ("s", "#56b4e9", "feature grid, other samples per ray"),
-    "paper": ("D", "#d55e00", "paper's networks, reduced"),
+    "vanilla": ("D", "#d55e00", "vanilla NeRF, reduced"),
     "ablation": ("v", "#cc79a7", "reduced, a part left out"),
-    "published": ("P", "#e69f00", "paper's networks, published"),
+    "published": ("P", "#e69f00", "vanilla NeRF, published"),
     "workspace": ("*", "#009e73", "this workspace's field"),
 }
 SIZE = (10.5, 6.2)  # inches

@@ -20,22 +20,23 @@ from stages.effects.decisions import Space, read_decisions
 from stages.hardware.device import processors
 from stages.io.ascii_names import shell_quoted
 from stages.io.pixels import load_pixels
-from stages.train import fields
+from stages.train.config import FieldName
 from stages.train.data import scaled_size
 from stages.train.fields import hash_grid
+from stages.train.fields.field_list import field_of
 from stages.train.planning import chosen_downscale, rays_per_second
 
 LONGEST_RUN = 1 / 20
 LEVEL_RATIO = 1.7
 NUM_LEVELS = 6
 MIN_STEPS = 30  # a training of fewer says nothing of its field
-SMALL_SIDE = 128  # pixels: of photos for the paper's networks, which learn nothing finer in so little time
+SMALL_SIDE = 128  # pixels: of photos for the vanilla NeRF, which learn nothing finer in so little time
 WALL_TIME_RATIO = 1.2  # wall time of a run over its training seconds: validation, files, photos read before
 VALIDATION_RAYS = 6144  # rendered at the end of a training, which takes long only where a field renders slowly
 MAX_SCORING = 0.03  # of the study's time, for one score: where it would take more, only every SCORING_STRIDE-th pixel
 SCORING_STRIDE = 4  # is rendered, along both axes of the crops
 MAX_RUN = 1 / 6  # of the study's time, for one run
-RENDERING_SPEED = {"grid": 0.7, "paper": 3.0}
+RENDERING_SPEED: dict[FieldName, float] = {"grid": 0.7, "vanilla": 3.0}
 """Rays rendered a second over rays trained, about: rendering does less, but a grid field of few steps is all fog."""
 OTHER_TIME = 0.03  # of the study's time: measuring speeds before it, drawing plots after it
 
@@ -56,40 +57,46 @@ class Variant(NamedTuple):
     grid_size: GridSize | None = None
 
 
-REDUCED, PUBLISHED, FEWER_RAYS = "paper, reduced", "paper, published", "paper, published, 64 rays a step"
+REDUCED, PUBLISHED, FEWER_RAYS = "vanilla, reduced", "vanilla, published", "vanilla, published, 64 rays a step"
 WORKSPACE_FIELD = "this workspace's field"  # no variant that a study trains: it exists, and is scored like the others
-WHOLE: Mapping[str, Any] = {"view_dependence": True, "batch_rays": 256}
-"""The reduced method with all its parts. Half the rays that stage train would give it, for twice the steps."""
-FULL: Mapping[str, Any] = {"view_dependence": True, "preset": "paper"}
+
+
+def _reduced(view_dependence: bool = True, **options: Any) -> Mapping[str, Any]:
+    """The reduced method with all its parts but for ``options``. Half the rays that stage train would give it, for
+    twice the steps."""
+    return {"view_dependence": view_dependence, "vanilla": {"batch_rays": 256, **options}}
+
+
+AS_PUBLISHED: Mapping[str, Any] = {"view_dependence": True, "preset": "paper"}
 VARIANTS: dict[str, Variant] = {
     "small grid": Variant("grid", {}, "small grid", grid_size="small"),
     "grid": Variant("grid", {}, "grid", grid_size="usual"),
     "large grid": Variant("grid", {}, "large grid", grid_size="large"),
-    "grid, half the samples": Variant("grid samples", {"ray_samples": 0.5}, "grid", grid_size="usual"),
-    "grid, twice the samples": Variant("grid samples", {"ray_samples": 2.0}, "grid", grid_size="usual"),
-    REDUCED: Variant("paper", WHOLE, REDUCED),
-    "paper, half the samples": Variant("paper", {**WHOLE, "samples_coarse": 16, "samples_fine": 16}, REDUCED, 0.5),
-    "paper, twice the samples": Variant("paper", {**WHOLE, "samples_coarse": 64, "samples_fine": 64}, REDUCED, 2.0),
-    "no hierarchical sampling": Variant("ablation", {**WHOLE, "hierarchical": False}, REDUCED),
-    "no positional encoding": Variant("ablation", {**WHOLE, "positional_encoding": False}, REDUCED),
-    "no view dependence": Variant("ablation", {**WHOLE, "view_dependence": False}, REDUCED),
-    PUBLISHED: Variant("published", FULL, PUBLISHED, min_steps=300),
-    FEWER_RAYS: Variant("published", {**FULL, "batch_rays": 64}, FEWER_RAYS),
+    "grid, half the samples": Variant("grid samples", {"grid": {"ray_samples": 0.5}}, "grid", grid_size="usual"),
+    "grid, twice the samples": Variant("grid samples", {"grid": {"ray_samples": 2.0}}, "grid", grid_size="usual"),
+    REDUCED: Variant("vanilla", _reduced(), REDUCED),
+    "vanilla, half the samples": Variant("vanilla", _reduced(samples_coarse=16, samples_fine=16), REDUCED, 0.5),
+    "vanilla, twice the samples": Variant("vanilla", _reduced(samples_coarse=64, samples_fine=64), REDUCED, 2.0),
+    "no hierarchical sampling": Variant("ablation", _reduced(hierarchical=False), REDUCED),
+    "no positional encoding": Variant("ablation", _reduced(positional_encoding=False), REDUCED),
+    "no view dependence": Variant("ablation", _reduced(view_dependence=False), REDUCED),
+    PUBLISHED: Variant("published", AS_PUBLISHED, PUBLISHED, min_steps=300),
+    FEWER_RAYS: Variant("published", {**AS_PUBLISHED, "vanilla": {"batch_rays": 64}}, FEWER_RAYS),
 }
-GRID = "{levels} grids of features, the finest of {finest:,}³ cells"
+GRID = "{grid[num_levels]} grids of features, the finest of {grid[max_res]:,}³ cells"
 DESCRIPTIONS = {
     "small grid": GRID,
     "grid": GRID,
     "large grid": GRID,
-    "grid, half the samples": "the same {levels} grids with half as many samples along a ray",
-    "grid, twice the samples": "the same {levels} grids with twice as many samples along a ray",
-    REDUCED: "the paper's two networks made small: 4 layers of 64, 32 + 32 samples along a ray, 256 rays a step",
-    "paper, half the samples": "two such networks with 16 + 16 samples along a ray, for as many steps",
-    "paper, twice the samples": "two such networks with 64 + 64 samples along a ray, for as many steps",
+    "grid, half the samples": "the same {grid[num_levels]} grids with half as many samples along a ray",
+    "grid, twice the samples": "the same {grid[num_levels]} grids with twice as many samples along a ray",
+    REDUCED: "the vanilla NeRF's two networks made small: 4 layers of 64, 32 + 32 samples along a ray, 256 rays a step",
+    "vanilla, half the samples": "two such networks with 16 + 16 samples along a ray, for as many steps",
+    "vanilla, twice the samples": "two such networks with 64 + 64 samples along a ray, for as many steps",
     "no hierarchical sampling": "one such network with as many samples, all stratified",
     "no positional encoding": "two such networks on bare coordinates",
     "no view dependence": "two such networks without the direction of the ray",
-    PUBLISHED: "the paper's two networks: 8 layers of 256, 64 + 128 samples along a ray, 1,024 rays a step",
+    PUBLISHED: "the vanilla NeRF's two networks: 8 layers of 256, 64 + 128 samples along a ray, 1,024 rays a step",
     FEWER_RAYS: "the same, 8 layers of 256, 64 + 128 samples along a ray, but 64 rays a step instead of 1,024",
     WORKSPACE_FIELD: "the field of the workspace when the study was made, with the seconds of its own training",
 }
@@ -98,7 +105,7 @@ ABLATIONS = tuple(name for name, variant in VARIANTS.items() if variant.family =
 TIMED = tuple(dict.fromkeys(variant.timed_as for variant in VARIANTS.values()))
 
 # Groups of runs: (variant, which of the study's photo sizes, which budget levels). Sizes count from the finest; SMALL
-# is the size for the paper's networks.
+# is the size for the vanilla NeRF.
 FINE, MIDDLE, COARSE, SMALL = 0, 1, 2, -1
 Groups = Sequence[tuple[str, int, Sequence[int]]]
 GRID_LEVELS: Groups = [
@@ -111,10 +118,10 @@ SMALLER: Groups = [("small grid", MIDDLE, [2])]
 OUTER_LEVELS: Groups = [("grid", MIDDLE, [0, NUM_LEVELS - 1]), ("grid", FINE, [0])]
 INNER_LEVELS: Groups = [("grid", MIDDLE, range(1, NUM_LEVELS - 1))]
 SAMPLES: Groups = [(name, MIDDLE, [2, 3]) for name, v in VARIANTS.items() if v.family == "grid samples"]
-PAPER: Groups = [(PUBLISHED, SMALL, [1]), (FEWER_RAYS, SMALL, [1]), ("paper, half the samples", SMALL, [1])]
+VANILLA: Groups = [(PUBLISHED, SMALL, [1]), (FEWER_RAYS, SMALL, [1]), ("vanilla, half the samples", SMALL, [1])]
 SIZES: Groups = [("small grid", MIDDLE, [3, 1]), ("large grid", FINE, [1, 0]), ("grid", FINE, [2])]
-LONGER: Groups = [("paper, twice the samples", SMALL, [1]), (REDUCED, SMALL, [0])]
-EVERYTHING: Groups = [*ABLATION, *GRID_LEVELS, *SMALLER, *SAMPLES, *PAPER, *SIZES, *LONGER]
+LONGER: Groups = [("vanilla, twice the samples", SMALL, [1]), (REDUCED, SMALL, [0])]
+EVERYTHING: Groups = [*ABLATION, *GRID_LEVELS, *SMALLER, *SAMPLES, *VANILLA, *SIZES, *LONGER]
 
 
 class Speed(NamedTuple):
@@ -176,9 +183,9 @@ class Schedule(NamedTuple):
         return sum(run.seconds for run in self.runs)
 
 
-def field_of(variant: str) -> Literal["grid", "paper"]:
-    """The kind of field of a variant, as stage train calls it."""
-    return "grid" if VARIANTS[variant].family.startswith("grid") else "paper"
+def field_name(variant: str) -> FieldName:
+    """The field of a variant, as stage train calls it."""
+    return train.Config(**VARIANTS[variant].options).kind
 
 
 def family_of(variant: str) -> str:
@@ -189,15 +196,17 @@ def family_of(variant: str) -> str:
 def grid_sizes(size: GridSize, space: Space) -> dict[str, int]:
     """Sizes of a grid field: those that stage train has on a CPU for long runs (``usual``) and for short ones, whatever
     the size of the photos, and larger still, by one grid, twice the rows and twice the cells along an axis."""
-    (_, levels, log2_rows, finest), (_, *small) = hash_grid.SIZES[space]
-    of = {"small": small, "usual": (levels, log2_rows, finest), "large": (levels + 1, log2_rows + 1, 2 * finest)}
-    return dict(zip(("levels", "log2_rows", "finest"), of[size], strict=True))
+    (_, *usual), (_, *small) = hash_grid.SIZES[space]
+    large = (usual[0] + 1, usual[1] + 1, 2 * usual[2])
+    of = {"small": small, "usual": usual, "large": large}
+    return dict(zip(("num_levels", "log2_hashmap_size", "max_res"), of[size], strict=True))
 
 
 def train_options(variant: str, space: Space) -> dict[str, Any]:
     """The field of a variant as stage train is asked for it in such a space."""
     options, size = VARIANTS[variant].options, VARIANTS[variant].grid_size
-    return {"field": field_of(variant), **options, **(grid_sizes(size, space) if size else {})}
+    sized = {"grid": {**options.get("grid", {}), **grid_sizes(size, space)}} if size else {}
+    return {"field": field_name(variant), **options, **sized}
 
 
 def describe(variants: Collection[str], space: Space) -> str:
@@ -211,17 +220,21 @@ def train_command(variant: str, seconds: float, downscale: float, space: Space, 
     """What trains a variant for so long in a workspace. Field and preset are given, because it may remember others, and
     the field's sizes, because those that would be chosen follow from a timing."""
     given = {"seconds": max(1, round(seconds)), "downscale": downscale, "preset": "standard"}
-    flags = [_flag(name, value) for name, value in (given | train_options(variant, space)).items()]
+    flags = _flags("train", given | train_options(variant, space))
     return " ".join(["pipeline train", shell_quoted(workspace), *flags])
 
 
-def _flag(name: str, value: Any) -> str:
-    if name == "view_dependence":  # an option of stage effects
-        return f"--effect view_dependence={'on' if value else 'off'}"
-    flag = name.replace("_", "-")
-    if value is False:
-        return f"--train.no-{flag}"
-    return f"--train.{flag} {value if isinstance(value, str) else format(value, 'g')}"
+def _flags(group: str, options: Mapping[str, Any]) -> Iterator[str]:
+    for name, value in options.items():
+        flag = name.replace("_", "-")
+        if isinstance(value, Mapping):
+            yield from _flags(f"{group}.{flag}", value)
+        elif name == "view_dependence":  # an option of stage effects
+            yield f"--effect view_dependence={'on' if value else 'off'}"
+        elif value is False:
+            yield f"--{group}.no-{flag}"
+        else:
+            yield f"--{group}.{flag} {value if isinstance(value, str) else format(value, 'g')}"
 
 
 # --- which runs fit the time
@@ -233,7 +246,7 @@ def run_order(seeds: int) -> Iterator[tuple[str, int, int, int]]:
     second seeds of the inner levels; sizes of grids; every other seed."""
     rounds: list[tuple[Groups, int]] = [([*GRID_LEVELS, *ABLATION, *SMALLER], 0)]
     rounds += [([*OUTER_LEVELS, *ABLATION], 1)] if seeds > 1 else []
-    rounds += [([*SAMPLES, *PAPER], 0)]
+    rounds += [([*SAMPLES, *VANILLA], 0)]
     rounds += [(INNER_LEVELS, 1)] if seeds > 1 else []
     rounds += [([*SIZES, *LONGER], 0), *((EVERYTHING, seed) for seed in range(1, seeds))]
     keys = (
@@ -254,7 +267,7 @@ def make_schedule(
     """The runs that fit into ``seconds``, in the order of :func:`run_order`; one that does not fit gives way to cheaper
     ones behind it.
 
-    ``downscales`` are the photo sizes, the last one that for the paper's networks; equal sizes make one run.
+    ``downscales`` are the photo sizes, the last one that for the vanilla NeRF; equal sizes make one run.
     ``scored_rays`` are rendered to score each, and the first run at a photo size has to read the photos. The published
     networks take fewer rays a step only where there is no time for as many as published.
     """
@@ -295,7 +308,7 @@ def _run(
 
 def rendered_rays_per_second(variant: str, speed: Speed) -> float:
     """Rays rendered a second, expected of a variant from the ``speed`` of training of the one it is timed as."""
-    return speed.rays * RENDERING_SPEED[field_of(variant)] / VARIANTS[variant].cost
+    return speed.rays * RENDERING_SPEED[field_name(variant)] / VARIANTS[variant].cost
 
 
 def scoring_stride(rendering: float, seconds: float) -> int:
@@ -347,14 +360,15 @@ def measure_speeds(scene: Scene, inputs: Inputs, seconds: float, progress: Progr
     for number, name in enumerate(TIMED):
         progress.update(f"timing the training of: {name}", number / len(TIMED))
         config = _planned(name, decisions.space, inputs, progress)
+        rays_per_step = field_of(config).rays_per_step(config)
         if VARIANTS[name].family == "published":
             reduced = _planned(REDUCED, decisions.space, inputs, progress)
             rays = speeds[REDUCED].rays * _multiplications(reduced) / _multiplications(config)
-            if LONGEST_RUN * seconds * rays < VARIANTS[name].min_steps * fields.field_of(config).rays_per_step(config):
-                speeds[name] = Speed(rays / fields.field_of(config).rays_per_step(config), rays)
+            if LONGEST_RUN * seconds * rays < VARIANTS[name].min_steps * rays_per_step:
+                speeds[name] = Speed(rays / rays_per_step, rays)
                 continue
         rays = rays_per_second(config, scene, decisions)
-        speeds[name] = Speed(rays / fields.field_of(config).rays_per_step(config), rays)
+        speeds[name] = Speed(rays / rays_per_step, rays)
     return speeds
 
 
@@ -365,9 +379,10 @@ def _planned(name: str, space: Space, inputs: Inputs, progress: Progress) -> tra
 
 
 def _multiplications(config: train.Config) -> float:
-    """Of a ray through both networks of a paper field, about."""
-    assert config.samples_coarse and config.samples_fine and config.depth and config.width
-    return (2 * config.samples_coarse + config.samples_fine) * config.depth * config.width**2
+    """Of a ray through both networks of a vanilla NeRF, about."""
+    sizes = config.vanilla
+    assert sizes.samples_coarse and sizes.samples_fine and sizes.depth and sizes.width
+    return (2 * sizes.samples_coarse + sizes.samples_fine) * sizes.depth * sizes.width**2
 
 
 def measure_reading(scene: Scene, ingest: Path, crops: int) -> ReadingTime:
@@ -396,7 +411,7 @@ def study_sizes(scene: Scene, speeds: Mapping[str, Speed], seconds: float) -> tu
 def photo_sizes(chosen: float, largest: float, longer_side: float) -> tuple[float, ...]:
     """The downscales of a study, the finest first: half of the one ``chosen`` for its longest run, so that finer photos
     have their chance, twice and four times that, whole numbers; none beyond ``largest``, none nearly another. Then that
-    for the paper's networks: it leaves at most SMALL_SIDE of ``longer_side`` pixels."""
+    for the vanilla NeRF: it leaves at most SMALL_SIDE of ``longer_side`` pixels."""
     most = max(1, int(largest))
     sizes = [float(min(max(1, round(chosen / 2)) * factor, most)) for factor in (1, 2, 4)]
     kept = [size for index, size in enumerate(sizes) if index == 0 or size > 1.25 * sizes[index - 1]]

@@ -15,13 +15,13 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from stages.io.files import write_durably
-from stages.train.health_check import Lost
+from stages.train.health_check import TrainingFailure
 
 KEPT = 2
 
 
 class Checkpoint(NamedTuple):
-    """A training state: tensors, and whatever else the run must know to go on, as JSON values."""
+    """A training state: its tensors, and the rest of the run state as JSON values."""
 
     step: int
     tensors: dict[str, Tensor]
@@ -29,7 +29,7 @@ class Checkpoint(NamedTuple):
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
-    """Write ``checkpoint`` and forget all but the last KEPT."""
+    """Write ``checkpoint`` and remove all but the last KEPT."""
     folder.mkdir(parents=True, exist_ok=True)
     tensors = save({name: tensor.contiguous() for name, tensor in checkpoint.tensors.items()})
     name = f"{checkpoint.step:09d}"
@@ -48,24 +48,24 @@ def latest_checkpoint(
     fits: Callable[[Checkpoint], None] = lambda _: None,
     remove: bool = True,
 ) -> Checkpoint | None:
-    """The newest good checkpoint, or None; every damaged one met on the way is named to ``note``, and removed unless
-    the folder is a finished run's (``remove``).
+    """The newest good checkpoint, or None. Newer ones that are damaged are named to ``note``, and removed unless the
+    folder is a finished run's (``remove``).
 
-    ``fits`` raises RuntimeError or TypeError for a checkpoint that is whole and belongs to something else, Lost for one
-    of a field that is no good.
+    ``fits`` raises RuntimeError or TypeError for an intact checkpoint of something else, TrainingFailure for one of a
+    field that has collapsed or diverged.
     """
     for step in reversed(_steps(folder)):
         try:
             checkpoint = _read(folder, step)
             fits(checkpoint)
             return checkpoint
-        except (OSError, ValueError, KeyError) as fault:
-            wrong = f"is damaged ({fault})"
-        except Lost as fault:
-            wrong = f"is of no use ({fault})"
-        except (RuntimeError, TypeError) as fault:
-            wrong = f"is not of this training ({' '.join(str(fault).split())})"
-        note("train.checkpoint-skipped", f"the checkpoint of step {step} {wrong}; going back to the one before")
+        except (OSError, ValueError, KeyError) as error:
+            problem = f"is damaged ({error})"
+        except TrainingFailure as error:
+            problem = f"holds a failed field ({error})"
+        except (RuntimeError, TypeError) as error:
+            problem = f"belongs to another training ({' '.join(str(error).split())})"
+        note("train.checkpoint-skipped", f"the checkpoint of step {step} {problem}; using the one before")
         if remove:
             (folder / f"{step:09d}.json").unlink()
             (folder / f"{step:09d}.safetensors").unlink(missing_ok=True)
@@ -91,5 +91,5 @@ def _read(folder: Path, step: int) -> Checkpoint:
     meta = json.loads((folder / f"{step:09d}.json").read_bytes())
     tensors = (folder / f"{step:09d}.safetensors").read_bytes()
     if _digest(f"{step:09d}", meta["facts"], tensors) != meta["sha256"]:
-        raise ValueError("it is not what was written")
+        raise ValueError("its content does not match its sha256")
     return Checkpoint(step, load(tensors), meta["facts"])

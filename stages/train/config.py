@@ -1,34 +1,38 @@
 """The options of stage train: what the command line, a file and a caller from Python may ask for."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 from tyro.conf import Suppress, arg
 
-from stages.contract import StageConfig
+from stages.contract import Options, StageConfig
 from stages.effects.decisions import Space
+from stages.train.fields.hash_grid_options import HashGridOptions
+from stages.train.fields.vanilla_options import VanillaOptions
 
 # Of training, where neither seconds nor steps are given.
 SECONDS = {"draft": 30.0, "standard": 180.0, "high": 900.0, "paper": 3600.0}
-MAX_MICRO_BATCHES = 64  # of a step
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
-GRID_ONLY = ("backend", "chunks", "levels", "log2_rows", "finest", "batch_samples", "ray_samples")
-PAPER_ONLY = (
-    *("batch_rays", "depth", "width", "skip", "position_frequencies", "direction_frequencies"),
-    *("samples_coarse", "samples_fine", "positional_encoding", "hierarchical"),
-    *("density_activation", "spacing"),
-)
+FieldName = Literal["grid", "vanilla"]
+"""Each has its own options in :class:`Config` under its name."""
+FIELD_NAMES: tuple[FieldName, ...] = get_args(FieldName)
+OPTIONS_OF_FIELD: dict[FieldName, type[HashGridOptions | VanillaOptions]] = {
+    "grid": HashGridOptions,
+    "vanilla": VanillaOptions,
+}
+DEFAULT_FIELD: FieldName = "grid"
+PRESET_FIELDS: dict[str, FieldName] = {"paper": "vanilla"}  # the field that a preset asks for, where it does
 
 
 class Config(StageConfig):
     """How to train. None is chosen for you, by the scene and the budget.
 
-    The options of the paper field ask for that field: without one of them, none is the grid field.
+    The options of a field ask for that field. What is written down holds those of no other one.
     """
 
-    field: Literal["grid", "paper"] | None = Field(
-        default=None, description="grid: minutes without a GPU; paper: the published networks; none: grid"
+    field: FieldName | None = Field(
+        default=None, description="grid: minutes without a GPU; vanilla: the published networks (default: grid)"
     )
     steps: int | None = Field(
         default=None, ge=1, description="train so many steps; on a CPU with the same result every time"
@@ -36,9 +40,9 @@ class Config(StageConfig):
     preset: Literal["draft", "standard", "high", "paper"] | None = Field(
         default=None,
         description="draft, standard, high: train for half a minute, three, fifteen, in sizes to match; "
-        "paper: the networks as published, for an hour; none: standard",
+        "paper: the vanilla NeRF as published, for an hour (default: standard)",
     )
-    seconds: float | None = Field(default=None, gt=0, description="train so long; none, without steps: by the preset")
+    seconds: float | None = Field(default=None, gt=0, description="train so long (default: from the preset)")
     target_psnr: Annotated[float | None, arg(aliases=("--target-psnr",))] = Field(
         default=None,
         gt=0,
@@ -46,18 +50,18 @@ class Config(StageConfig):
         description="stop once so many dB are reached on validation photos, set aside from the training photos; at "
         "the latest when the time or the steps are used up",
     )
-    learning_rate: float | None = Field(default=None, gt=0, description="at the start; none: by the field")
+    learning_rate: float | None = Field(default=None, gt=0, description="at the start (default: from the field)")
     seed: int = Field(default=0, description="of weights, batches and samples")
     downscale: float | None = Field(
-        default=None, ge=1, description="photo width / trained width; none: as the budget allows"
+        default=None, ge=1, description="photo width / trained width (default: as the budget allows)"
     )
     background: Literal["white", "black", "random"] | None = Field(
-        default=None, description="behind photos with transparency; none: random for grid, white for paper"
+        default=None, description="behind photos with transparency (default: random for grid, white for vanilla)"
     )
     matmul: Literal["highest", "medium"] | None = Field(
         default=None,
-        description="torch's precision of matrix products; none: highest, of a run in seconds medium where that is "
-        "measured to be faster and about as exact",
+        description="torch's precision of matrix products (default: highest; of a run in seconds medium where that is "
+        "measured to be faster and about as exact)",
     )
     # `--more` gives these.
     after: Annotated[str | None, Suppress] = Field(default=None, description="go on from this finished training,")
@@ -67,88 +71,57 @@ class Config(StageConfig):
     contracted: Annotated[bool | None, Suppress] = Field(default=None, description="fold in unbounded space")
     view_dependence: Annotated[bool | None, Suppress] = Field(default=None, description="colour knows the direction")
 
-    backend: Literal["warp", "torch"] | None = Field(
-        default=None, description="grid: its kernels; none: warp where they run, torch runs anywhere"
-    )
-    chunks: int | None = Field(
-        default=None,
-        ge=1,
-        le=MAX_MICRO_BATCHES,
-        description="grid: parts of a step, each on a core; none: as many as cores",
-    )
-    levels: int | None = Field(default=None, ge=1, le=16, description="grid: grids of features")
-    log2_rows: int | None = Field(default=None, ge=8, le=24, description="grid: rows of a grid's table, as power of 2")
-    finest: int | None = Field(default=None, ge=16, le=4096, description="grid: cells along an axis of the finest grid")
-    batch_samples: int | None = Field(default=None, ge=256, description="grid: colours computed in a step")
-    ray_samples: float = Field(
-        default=1.0, gt=0, le=16, description="grid: samples along a ray, times what suits its finest cells"
-    )
-
-    batch_rays: int | None = Field(default=None, ge=1, description="paper: rays in a step; none: by the preset")
-    depth: int | None = Field(default=None, ge=1, description="paper: layers before the density")
-    width: int | None = Field(default=None, ge=2, description="paper: of each layer")
-    skip: int | None = Field(
-        default=None, ge=0, description="paper: index of the layer after which the position enters again"
-    )
-    position_frequencies: int = Field(
-        default=10, ge=1, description="paper: L of the positional encoding of the position"
-    )
-    direction_frequencies: int = Field(
-        default=4, ge=1, description="paper: L of the positional encoding of the direction"
-    )
-    samples_coarse: int | None = Field(default=None, ge=2, description="paper: on each ray, for the coarse network")
-    samples_fine: int | None = Field(
-        default=None, ge=1, description="paper: on each ray, placed by the coarse network's weights"
-    )
-    positional_encoding: bool = Field(default=True, description="paper: lift coordinates to sines and cosines")
-    hierarchical: bool = Field(default=True, description="paper: place fine samples by a coarse network")
-    density_activation: Literal["softplus", "relu"] = Field(
-        default="softplus", description="paper: relu is as published"
-    )
-    spacing: Literal["linear", "log"] | None = Field(
-        default=None, description="paper: of coarse samples; none: log if contracted"
-    )
+    grid: HashGridOptions = HashGridOptions()
+    vanilla: VanillaOptions = VanillaOptions()
 
     checkpoint_seconds: float | None = Field(
-        default=None, gt=0, description="between checkpoints; none: a twentieth of the seconds, 30 at most"
+        default=None, gt=0, description="between checkpoints (default: a twentieth of the seconds, 30 at most)"
     )
     tensorboard: bool = Field(default=False, description="write the curve for TensorBoard, too")
 
     @model_validator(mode="after")
     def _one_budget(self) -> "Config":
         if self.steps is not None and self.seconds is not None:
-            raise ValueError(f"steps ({self.steps}) and seconds ({self.seconds:g}) are two budgets; give one")
+            given = f"--train.steps {self.steps} and --train.seconds {self.seconds:g}"
+            raise ValueError(f"{given} are two budgets; give one")
         return self
 
     @model_validator(mode="after")
     def _one_field(self) -> "Config":
-        of_grid, of_paper = self._given(GRID_ONLY), self._given(PAPER_ONLY)
-        if self.preset == "paper":
-            of_paper.insert(0, "preset (paper)")
-        if of_grid and of_paper:
-            raise ValueError(f"{of_grid[0]} belongs to the grid field and {of_paper[0]} to the paper field; choose one")
-        if wrong := {"grid": of_paper, "paper": of_grid, None: []}[self.field]:
-            raise ValueError(f"{wrong[0]} does not belong to the {self.field} field; leave out one of the two")
+        first, *others = self._flags_by_field().values() or [""]
+        if others:
+            raise ValueError(f"{others[0]} has no effect with {first}; leave out one of the two")
         return self
 
+    @model_serializer(mode="wrap")
+    def _without_other_fields(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        others = {name for name in FIELD_NAMES if name != self.kind}
+        return {name: value for name, value in serialise(self).items() if name not in others}
+
+    def _flags_by_field(self) -> dict[FieldName, str]:
+        """By each field that these options ask for the first flag that does."""
+        flags: dict[FieldName, str] = {}
+        if self.field is not None:
+            flags[self.field] = f"--train.field {self.field}"
+        if (field := PRESET_FIELDS.get(self.preset or "")) is not None:
+            flags.setdefault(field, f"--train.preset {self.preset}")
+        for field in FIELD_NAMES:
+            options: Options = getattr(self, field)
+            for name, option in type(options).model_fields.items():
+                if getattr(options, name) != option.default:
+                    flags.setdefault(field, f"--train.{field}.{name.replace('_', '-')}")
+        return flags
+
     @property
-    def kind(self) -> Literal["grid", "paper"]:
+    def kind(self) -> FieldName:
         """The field that these options ask for."""
-        return self.field or ("paper" if self.preset == "paper" or self._given(PAPER_ONLY) else "grid")
+        asked: tuple[FieldName, ...] = (*self._flags_by_field(), DEFAULT_FIELD)
+        return asked[0]
 
     @property
     def space(self) -> Space:
         """Which of the measured constants count."""
         return "contracted" if self.contracted else "bounded"
-
-    def _given(self, names: tuple[str, ...]) -> list[str]:
-        """Which of these options differ from their defaults, with their values."""
-        values = {name: getattr(self, name) for name in names}
-        return [f"{n} ({value})" for n, value in values.items() if value != type(self).model_fields[n].default]
-
-    def filled(self, values: dict[str, Any]) -> "Config":
-        """These options with ``values`` where they are None."""
-        return self.model_copy(update={name: v for name, v in values.items() if getattr(self, name) is None})
 
     @property
     def time_is_open(self) -> bool:

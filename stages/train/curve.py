@@ -1,28 +1,40 @@
 """curve.json: quality against training time, and what it says in words.
 
-``{"field": "grid" | "paper", "downscale", "device": "cpu" | "cuda", "threads", "whole", "points": [{"step", "seconds",
-"train_psnr", "probe_psnr", "probe_ssim"} …]}``; what cannot be measured is null. ``downscale`` is that of the
-photos trained on. ``probe_psnr`` is of a fixed sample of pixels of all test photos, taken together, at the size at
+``{"field", "downscale", "device": "cpu" | "cuda", "threads", "single_cycle", "points": [{"step",
+"seconds", "train_psnr", "probe_psnr", "probe_ssim"} …]}``; what cannot be measured is null. ``downscale`` is that of
+the photos trained on. ``probe_psnr`` is of a fixed sample of pixels of all test photos, taken together, at the size at
 which photos are scored: it follows the score, PSNR of stage evaluate, and is not it. Seconds are those of training
-steps alone: measuring is not among them. ``whole``: the rate fell once, at the end, and never rose again to go on.
+steps alone, without evaluations. ``single_cycle``: the learning rate decayed once, at the end: no finished run was
+continued, and no target missed.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from nerf.training.learning_curve import KNEE_DB, Gain, knee, last_doubling, next_doubling, quality_at
+from nerf.training.learning_curve import (
+    MIN_DOUBLING_GAIN_DB,
+    PredictedGain,
+    diminishing_returns_seconds,
+    last_doubling_gain,
+    predicted_doubling_gain,
+    quality_at,
+)
 from stages.amounts import duration, duration_option
 from stages.hardware.device import compute_device, cores
 from stages.io.files import write_json
+from stages.train.config import OPTIONS_OF_FIELD, FieldName
 
 BARS = "▁▂▃▄▅▆▇█"
 SPARK_WIDTH = 10
 
 
-def write_curve(folder: Path, field: str, downscale: float, whole: bool, points: list[dict[str, Any]]) -> None:
+def write_curve(
+    folder: Path, field: FieldName, downscale: float, single_cycle: bool, points: list[dict[str, Any]]
+) -> None:
     """Write curve.json of a run that ends on this machine."""
-    about = {"field": field, "downscale": downscale, "device": compute_device(), "threads": cores(), "whole": whole}
+    about = {"field": field, "downscale": downscale, "device": compute_device(), "threads": cores()}
+    about["single_cycle"] = single_cycle
     write_json(folder / "curve.json", about | {"points": points})
 
 
@@ -32,60 +44,62 @@ def probe_curve(points: Sequence[dict[str, Any]]) -> list[tuple[float, float]]:
     return [(seconds, psnr) for seconds, psnr in known if psnr is not None and seconds > 0]
 
 
-def coming_doubling(field: str, whole: bool, points: Sequence[dict[str, Any]]) -> Gain | None:
-    """What the next doubling of the time is predicted to buy at the same sizes of photos and field, as ``--more`` keeps
-    them; None where the curve is too short, and for what the prediction was not fitted to: the paper's field, whose
-    rate falls all the way, and a run that is not ``whole``, where half of the time may have ended annealed, too."""
-    return next_doubling(probe_curve(points), points[-1]["step"]) if points and field == "grid" and whole else None
+def predicted_gain(field: FieldName, single_cycle: bool, points: Sequence[dict[str, Any]]) -> PredictedGain | None:
+    """The predicted gain of twice the training time at the same sizes of photos and field, as ``--more`` keeps them.
+    None if the curve is too short, and for runs that the prediction was not fitted to: those of another field than the
+    hash grid, and those not of a ``single_cycle``, which may have decayed at half of the time."""
+    fitted = single_cycle and OPTIONS_OF_FIELD[field].predicts_gains
+    return predicted_doubling_gain(probe_curve(points), points[-1]["step"]) if points and fitted else None
 
 
-def doubling_words(points: Sequence[dict[str, Any]], coming: Gain | None) -> str | None:
-    """What the last doubling of the time bought and what is ``coming``; None where the curve is too short."""
+def doubling_message(points: Sequence[dict[str, Any]], gain: PredictedGain | None) -> str | None:
+    """The gain of the last doubling of the time, and the predicted one of the next; None if the curve is too short."""
     curve = probe_curve(points)
-    last = last_doubling(curve)
+    last = last_doubling_gain(curve)
     if last is None:
         return None
-    words = f"the last doubling of training time, to {duration(curve[-1][0])}, bought {last:+z.1f} dB on test pixels"
-    if coming is None:
-        return words
-    words += " (less over a run of half the time, which would have ended above this curve)"
+    message = f"the last doubling of training time, to {duration(curve[-1][0])}, gained {last:+z.1f} dB on test pixels"
+    if gain is None:
+        return message
+    message += " (less over a run of half the time, which would have ended above this curve)"
     again = f"as long again at these sizes ({more_option(points)})"
-    return f"{words}; {again} is predicted to buy {coming.db:+z.1f} dB (± {coming.half_width:.1f})"
+    return f"{message}; {again} is predicted to gain {gain.db:+z.1f} dB (± {gain.half_width:.1f})"
 
 
-def next_words(points: Sequence[dict[str, Any]], coming: Gain | None) -> str | None:
-    """:func:`doubling_words` for a line that has no room."""
-    gain = coming and f"{coming.db:+z.1f} ± {coming.half_width:.1f} dB"
-    return gain and f"as long again ({more_option(points)}) is predicted to buy {gain}"
+def predicted_gain_message(points: Sequence[dict[str, Any]], gain: PredictedGain | None) -> str | None:
+    """The second part of :func:`doubling_message`, in short."""
+    if gain is None:
+        return None
+    return f"as long again ({more_option(points)}) is predicted to gain {gain.db:+z.1f} ± {gain.half_width:.1f} dB"
 
 
 def more_option(points: Sequence[dict[str, Any]]) -> str:
-    """``--more 3m``: as long again."""
+    """``--more 3m``, for as long again."""
     return f"--more {duration_option(points[-1]['seconds'])}"
 
 
-def target_words(target: float | None, reached: float | None, seconds: float) -> str | None:
+def target_message(target: float | None, reached: float | None, seconds: float) -> str | None:
     """Whether a target was reached, and after how long; None where there was none."""
     if target is None or reached is None:
         return None
     if reached >= target:
-        return f"{target:g} dB reached after {duration(seconds)}, on validation photos"
-    return f"{target:g} dB not reached in {duration(seconds)}: {reached:.1f} on validation photos"
+        return f"{target:g} dB reached on validation photos after {duration(seconds)}"
+    return f"{target:g} dB not reached in {duration(seconds)}: {reached:.1f} dB on validation photos"
 
 
-def knee_words(points: Sequence[dict[str, Any]]) -> str | None:
-    """Where the knee is, or that there is none; None where the curve is too short to tell."""
+def diminishing_returns_message(points: Sequence[dict[str, Any]]) -> str | None:
+    """From when on returns diminish, if they do; None if the curve is too short to tell."""
     curve = probe_curve(points)
-    if last_doubling(curve) is None:
+    if last_doubling_gain(curve) is None:
         return None
-    at = knee(curve)
-    if at is None:
-        return f"no knee yet: the last doubling bought more than {KNEE_DB:g} dB"
-    return f"the knee is at {duration(at)}: from there on a doubling bought less than {KNEE_DB:g} dB"
+    start = diminishing_returns_seconds(curve)
+    if start is None:
+        return f"no diminishing returns yet: the last doubling gained more than {MIN_DOUBLING_GAIN_DB:g} dB"
+    return f"diminishing returns from {duration(start)} on: each doubling gained less than {MIN_DOUBLING_GAIN_DB:g} dB"
 
 
-def ssim_words(points: Sequence[dict[str, Any]]) -> str | None:
-    """SSIM at the end and half of the time before; None where it is not known."""
+def ssim_message(points: Sequence[dict[str, Any]]) -> str | None:
+    """SSIM at the end and at half of the time; None if it is not known."""
     known = [(p["seconds"], p["probe_ssim"]) for p in points if p["probe_ssim"] is not None and p["seconds"] > 0]
     if len(known) < 2 or known[0][0] > known[-1][0] / 2:
         return None
@@ -96,7 +110,7 @@ def ssim_words(points: Sequence[dict[str, Any]]) -> str | None:
 
 
 def sparkline(points: Sequence[dict[str, Any]]) -> str:
-    """Held-out PSNR from the first measurement to the last, even in log time; "" for fewer than three."""
+    """Held-out PSNR from the first evaluation to the last, even in log time; "" for fewer than three."""
     curve = probe_curve(points)
     if len(curve) < 3:
         return ""

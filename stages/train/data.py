@@ -13,7 +13,7 @@ import torch
 from nerf.geometry.rays import Rays, rays_of_view
 from nerf.geometry.space_maps import Box, Contraction, Ndc, SpaceMap, enclosing_ndc
 from nerf.training.ray_dataset import PosedViews, RayDataset, make_ray_dataset
-from nerf.training.trainer import over
+from nerf.training.trainer import composite_over
 from stages.contract import Inputs, Progress, StageError
 from stages.effects.track_colours import training_tracks
 from stages.io.files import read_tensors
@@ -84,7 +84,7 @@ def training_dataset(
         sizes=[(photo.height, photo.width) for photo in store.photos],
         camera_of=[used.index(view.camera) for view in views],
         camera_directions=[directions(index) for index in range(len(used))],
-        placement=PosedViews(
+        posed_views=PosedViews(
             poses=torch.tensor(np.stack([view.scene_from_camera for view in views]), dtype=torch.float32),
             near=torch.tensor([view.near for view in views]),
             far=torch.tensor([view.far for view in views]),
@@ -126,7 +126,7 @@ def _ignored(
 
 def _masked(dataset: RayDataset, ignored: "Iterable[Tensor | None]", split: "Split", progress: Progress) -> RayDataset:
     try:
-        dataset = dataset.without(ignored)
+        dataset = dataset.with_masks(ignored)
     except ValueError as error:
         why = f"{error} of the {split} photos at this size"
         raise StageError(ALL_MASKED, "nothing is left to train on", why, "Give a smaller --train.downscale.") from error
@@ -162,7 +162,7 @@ class PhotoReader:
         """The photo of a view as (H, W, 3) float32 in [0, 1], over ``background`` where it has alpha."""
         pixels = torch.tensor(self._pixels(view)).float() / 255
         alpha = pixels[..., 3] if self.scene.has_alpha else None
-        return over(pixels[..., :3], alpha, torch.tensor(background, dtype=torch.float32))
+        return composite_over(pixels[..., :3], alpha, torch.tensor(background, dtype=torch.float32))
 
     def _pixels(self, view: "View") -> np.ndarray:
         """The photo of a view as uint8, out of the pixel store where that is there."""

@@ -1,15 +1,16 @@
-"""The training loop: goes on from a checkpoint, keeps to its budget, and does not let a sick field pass for a result.
+"""The training loop: it resumes from checkpoints, keeps to its budget, and returns no field that collapsed or diverged.
 
 What can happen to a run, and what the loop does:
 
-* killed: goes on from the last good checkpoint; the journal of step plans gives every step its old learning rate. A
-  run in seconds goes on by the clock: what was trained since that checkpoint is lost, and its time is spent;
-* a loss or gradient stops being finite: the batch is kept, the state rolled back and the rate halved, three times;
-* the field is dead after the warm-up (empty, or no better than one flat colour): another seed, twice at most;
-* it is so later, or at the end: back to the last checkpoint, like after a loss that is not finite. A run that ends
-  within the warm-up is too short to judge: it ends, and says aloud what is wrong with it;
-* it goes on from the end of a finished run: from that run's last checkpoint, at the rates of the longer run;
-* it comes near a target on validation photos: it anneals early, and goes on as before if that was not enough.
+* it is killed: it resumes from the last good checkpoint; the saved step schedule gives every step the learning rate it
+  had. A run in seconds continues by the clock: training since that checkpoint is lost, and its time counts as spent;
+* a loss or gradient is not finite: it keeps the batch, rolls back and halves the learning rate, three times at most;
+* the field has collapsed after MIN_HEALTHY_STEPS (empty, or no better than one flat colour): it restarts with another
+  seed, twice at most;
+* it collapses or diverges later, or at the end: back to the last checkpoint, as after a loss that is not finite. A run
+  of fewer than MIN_HEALTHY_STEPS is too short to judge: it ends as undertrained, with the reason;
+* it continues a finished run: from that run's last checkpoint, at the learning rate of the longer run;
+* it comes near a target on validation photos: the learning rate decays early, and goes back up if that was not enough.
 """
 
 import json
@@ -22,399 +23,429 @@ from pathlib import Path
 
 from safetensors.torch import save
 
-from nerf.training.schedule import CLOSING_SHARE, ScheduleRevision, StepSchedule, next_in_series, replanned, schedule_of
-from nerf.training.trainer import RAYS, FieldTrainer, NonFinite
-from nerf.training.validation_probe import ProbeResult, measure
+from nerf.training.evaluation_pixels import PixelEvaluation, evaluate
+from nerf.training.schedule import (
+    DECAY_START_PROGRESS,
+    ScheduleRevision,
+    StepSchedule,
+    new_schedule,
+    next_in_series,
+    revised_by_clock,
+)
+from nerf.training.trainer import RAY_GEOMETRY, FieldTrainer, NonFinite
 from stages.amounts import short_count
 from stages.contract import Progress, StageError
 from stages.io.files import read_json, write_durably
 from stages.io.live_line import live_line
 from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
-from stages.train.health_check import Lost, is_suspicious, not_finite, symptom_of
-from stages.train.more import cannot_go_on
-from stages.train.profile import observed
-from stages.train.state import Pace, Probes, RunState, TrainingBudget, TrainingLog, checkpoint_interval, lost_seconds
-from stages.train.validation_images import Target, load_metrics, look
+from stages.train.health_check import TrainingFailure, failure_reason, needs_full_check, non_finite_tensor
+from stages.train.more import cannot_continue
+from stages.train.profile import profiled_step
+from stages.train.state import (
+    EvaluationSets,
+    RunState,
+    TrainingBudget,
+    TrainingLog,
+    TrainingSpeed,
+    checkpoint_interval,
+    lost_seconds,
+)
+from stages.train.validation_images import Target, evaluate_held_out, load_metrics
 
 MAX_ROLLBACKS = 3
 MAX_RESTARTS = 2
-WARM_UP_STEPS = 500  # after these a field is examined; a healthy one beats a flat colour long before
-FIRST_MEASUREMENT = {"seconds": 2.0, "steps": 64.0}  # of training; the next follow at so many times that, and so on:
-MEASUREMENT_GROWTH, TARGET_GROWTH = 2**0.5, 1.1  # the second where a measurement may end the run
-MAX_MEASURING = 0.05  # of a run in seconds: the share of the time that may go into measuring
-# By how much PSNR may be expected to rise while the rate falls (0.9 dB is the mean of 33 short runs): so far below a
-# target a run anneals.
-ANNEALING_DB = 1.0
-PLAN_SHARE = 0.01  # of a budget in seconds: how often the clock is looked at, and how far off a plan may be
-PROVISIONAL_STEPS = 1_000_000  # the plan of a run in seconds until its first step has been timed
-MAX_LOST = 0.5  # of a run in seconds: however often it is killed, it has the other half to come to something
+MIN_HEALTHY_STEPS = 500  # from here on a field's health is checked; a healthy one beats a flat colour long before
+FIRST_EVALUATION = {"seconds": 2.0, "steps": 64.0}  # of training; each next one comes later by a factor:
+EVALUATION_GROWTH, TARGET_EVALUATION_GROWTH = 2**0.5, 1.1  # the second where an evaluation may end the run
+MAX_EVALUATION_FRACTION = 0.05  # of the time of a run in seconds
+# The PSNR that the decay phase is expected to gain (0.9 dB is the mean of 33 short runs): this far below a target it
+# begins.
+DECAY_GAIN_DB = 1.0
+SCHEDULE_TOLERANCE = 0.01  # of a budget in seconds: how often the clock is read, and how far off a schedule may be
+PROVISIONAL_STEPS = 1_000_000  # the schedule of a run in seconds until its first step has been timed
+MAX_LOST_FRACTION = 0.5  # of a run in seconds: however often it is killed, the other half is left to train in
 
 
 class TrainingRun:
     """One training run in one folder. ``make_trainer(attempt)`` builds a fresh trainer; attempt 0 is the first.
 
-    Its public attributes are the outcome once :meth:`train` has returned: ``trainer``, ``state``, ``plan``.
+    Its public attributes are the outcome once :meth:`train` has returned: ``trainer``, ``state``, ``schedule``.
     """
 
     def __init__(
         self,
         make_trainer: Callable[[int], FieldTrainer],
-        probes: Probes,
+        evaluation_sets: EvaluationSets,
         budget: TrainingBudget,
         folder: Path,
         checkpoint_seconds: float | None,
         log: TrainingLog,
         progress: Progress,
     ) -> None:
-        self.make_trainer, self.probes, self.budget = make_trainer, probes, budget
+        self.make_trainer, self.evaluation_sets, self.budget = make_trainer, evaluation_sets, budget
         self.folder, self.log, self.progress, self.checkpoint_seconds = folder, log, progress, checkpoint_seconds
-        self.checkpoints, self.journal, self.spent = folder / "checkpoints", folder / "plan.json", folder / "spent.txt"
-        self.pace, self.next_planning = Pace(), 0.0
+        self.checkpoints = folder / "checkpoints"
+        self.schedule_file, self.elapsed_file = folder / "schedule.json", folder / "elapsed.txt"
+        self.speed, self.next_revision = TrainingSpeed(), 0.0
         checkpoint = latest_checkpoint(self.checkpoints, progress.note, self._fits)
         if checkpoint is None and budget.after is not None:
-            self._go_on(budget.after)
+            self._extend(budget.after)
         elif checkpoint is None or checkpoint.step == 0:
-            self._begin(RunState(**checkpoint.facts) if checkpoint else RunState())
+            self._start(RunState(**checkpoint.facts) if checkpoint else RunState())
         else:
             self._resume(checkpoint)
-        if words := lost_words(self.lost):
-            progress.note("train.lost-time", words)
+        if message := lost_time_message(self.lost):
+            progress.note("train.lost-time", message)
 
     def train(self) -> None:
-        """Train to the end of the budget. Raises StageError where the field diverges or stays dead."""
-        with live_line(self.progress, self._describe):
-            over = False
-            while not over:
+        """Train to the end of the budget. Raises StageError if the field diverges, or collapses with every seed."""
+        with live_line(self.progress, self._progress_line):
+            finished = False
+            while not finished:
                 try:
                     self._take_steps()
-                    over = self._is_over
-                except (NonFinite, Lost) as fault:
-                    self._roll_back(fault)
+                    finished = self._is_finished
+                except (NonFinite, TrainingFailure) as failure:
+                    self._roll_back(failure)
         self._save()
 
     @property
-    def _is_over(self) -> bool:
-        """Whether the last step of the plan is taken and measured."""
+    def _is_finished(self) -> bool:
+        """Whether the last step of the schedule is taken and evaluated."""
         step, curve = self.state.step, self.state.curve
-        return step == self.plan.total_steps and bool(curve) and curve[-1]["step"] == step
+        return step == self.schedule.total_steps and bool(curve) and curve[-1]["step"] == step
 
-    def _begin(self, state: RunState) -> None:
+    def _start(self, state: RunState) -> None:
         """Start from fresh weights; ``state`` carries over what earlier attempts cost."""
         self.state = state
         self.trainer: FieldTrainer = self.make_trainer(state.restarts)
-        self.lost = lost_seconds(self.spent, state)
-        steps, self.clock_budget = self._limits()
-        self.plan: StepSchedule = schedule_of(steps or PROVISIONAL_STEPS)
-        self._plan_measurement()
-        self._write_journal()
+        self.lost = lost_seconds(self.elapsed_file, state)
+        steps, self.clock_budget = self._budget_limits()
+        self.schedule: StepSchedule = new_schedule(steps or PROVISIONAL_STEPS)
+        self._schedule_evaluation()
+        self._write_schedule()
         self._save()
 
-    def _go_on(self, folder: Path) -> None:
-        """Start from the end of the finished run in ``folder``, at the rate that the longer run would have there."""
+    def _extend(self, folder: Path) -> None:
+        """Start from the end of the finished run in ``folder``, at the learning rate of the longer run."""
         checkpoint = latest_checkpoint(folder / "checkpoints", self.progress.note, remove=False)
         if checkpoint is None:
-            raise cannot_go_on("train.no-state", f"the last state of the training in {folder} cannot be read")
+            raise cannot_continue("train.no-state", f"the last checkpoint of the training in {folder} cannot be read")
         try:
-            self._load(checkpoint, folder / "plan.json")
+            self._load(checkpoint, folder / "schedule.json")
         except (RuntimeError, TypeError) as error:
-            raise cannot_go_on(
-                "train.other-version", f"the training in {folder} is of another version of this program: {error}"
+            raise cannot_continue(
+                "train.other-version", f"another version of this program made the training in {folder}: {error}"
             ) from error
-        if self.state.step < self.plan.total_steps:
-            raise cannot_go_on(
-                "train.earlier-state", f"the last state of the training in {folder} cannot be read, only an earlier one"
+        if self.state.step < self.schedule.total_steps:
+            raise cannot_continue(
+                "train.earlier-state",
+                f"the last checkpoint of the training in {folder} cannot be read, only an earlier one",
             )
         self.state.steps_before, self.state.seconds_before = step, seconds = self.state.step, self.state.seconds
         self.state.validation_before = self.state.validation_psnr
-        steps, self.clock_budget = self._limits()
+        steps, self.clock_budget = self._budget_limits()
         if steps is None:
             assert self.budget.seconds is not None, "one of the two is given"
             steps = step + max(1, round(self.budget.seconds * step / seconds))
-        self.plan = self.plan.extended(steps)
-        self._write_journal()
+        self.schedule = self.schedule.extended_to(steps)
+        self._write_schedule()
         self._save()
-        self.log.event("extended", step, total_steps=self.plan.total_steps)
+        self.log.event("extended", step, total_steps=self.schedule.total_steps)
         self.progress.note(
-            "train.more", f"going on from the {step:,} steps of the finished training, in {self.plan.total_steps:,}"
+            "train.more", f"continuing the finished training from step {step:,} to step {self.schedule.total_steps:,}"
         )
-        if self.probes.target is not None and self.state.open_target(self.probes.target.psnr) is None:
-            self.progress.note("train.target-reached-before", reached_before_words(self.probes.target.psnr))
+        target = self.evaluation_sets.target
+        if target is not None and self.state.pending_target(target.psnr) is None:
+            self.progress.note("train.target-reached-before", target_already_reached_message(target.psnr))
 
-    def _limits(self) -> tuple[int | None, float | None]:
-        """The steps or seconds after which the run ends at the latest, those of earlier runs included; of the seconds
-        less what was lost."""
+    def _budget_limits(self) -> tuple[int | None, float | None]:
+        """The steps or seconds after which the run ends at the latest, including those of earlier runs and without the
+        seconds that were lost."""
         steps, seconds, _ = self.budget
         if steps is not None:
             return self.state.steps_before + steps, None
         assert seconds is not None, "one of the two is given"
-        return None, self.state.seconds_before + seconds - min(self.lost, MAX_LOST * seconds)
+        return None, self.state.seconds_before + seconds - min(self.lost, MAX_LOST_FRACTION * seconds)
 
     def _fits(self, checkpoint: Checkpoint) -> None:
-        """Raise RuntimeError for the state of another field, TypeError for facts that are not a run's."""
+        """Raise RuntimeError for the state of another field, TypeError for facts that are no run state."""
         self.make_trainer(RunState(**checkpoint.facts).restarts).load_state(checkpoint.tensors)
 
     def _resume(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint by the plan that held there; a run in seconds decides anew what it decided later."""
-        self._load(checkpoint, self.journal)
-        _, self.clock_budget = self._limits()
+        """Resume from a checkpoint with its schedule; a run in seconds makes later revisions again."""
+        self._load(checkpoint, self.schedule_file)
+        _, self.clock_budget = self._budget_limits()
         left = None
         if self.clock_budget is not None:
             left = self.clock_budget - self.state.seconds
-            self.plan = self.plan.until(self.state.step)
-            self._write_journal()
-        self._plan_checkpoint()
+            self.schedule = self.schedule.until(self.state.step)
+            self._write_schedule()
+        self._schedule_checkpoint()
         self.log.event("resumed", self.state.step)
-        self.progress.note("train.resumes", going_on_words(self.state.step, self.plan.total_steps, left))
+        self.progress.note("train.resumes", resumed_message(self.state.step, self.schedule.total_steps, left))
 
-    def _load(self, checkpoint: Checkpoint, journal: Path) -> None:
+    def _load(self, checkpoint: Checkpoint, schedule_file: Path) -> None:
         self.state = RunState(**checkpoint.facts)
         self.trainer = self.make_trainer(self.state.restarts)
         self.trainer.load_state(checkpoint.tensors)
-        self.plan = StepSchedule(tuple(ScheduleRevision(*decision) for decision in read_json(journal)))
-        self.lost = lost_seconds(self.spent, self.state)
-        self._plan_measurement()
+        self.schedule = StepSchedule(tuple(ScheduleRevision(*revision) for revision in read_json(schedule_file)))
+        self.lost = lost_seconds(self.elapsed_file, self.state)
+        self._schedule_evaluation()
 
     def _take_steps(self) -> None:
-        """Steps to the end of the plan, with everything that is due between them."""
-        while self.state.step < self.plan.total_steps:
+        """Steps to the end of the schedule, with everything that is due between them."""
+        while self.state.step < self.schedule.total_steps:
             self._take_step()
-            if self.state.step == WARM_UP_STEPS and (symptom := symptom_of(self.trainer, self.probes.train)):
-                self._restart(symptom)
-            if self._elapsed >= self.next_measurement:
-                self._examine()
-                self._measure()
-            if self.clock_budget is not None and self._planning_is_due:
-                self._replan(self.clock_budget)
+            if self.state.step == MIN_HEALTHY_STEPS and (reason := self._failure_reason()):
+                self._restart(reason)
+            if self._elapsed >= self.next_evaluation:
+                self._check_health()
+                self._evaluate()
+            if self.clock_budget is not None and self._revision_is_due:
+                self._revise_schedule(self.clock_budget)
             if time.monotonic() >= self.next_checkpoint:
-                self._examine()
+                self._check_health()
                 self._save()
-        self._examine_at_the_end()
-        if not self._is_over:
-            self._measure()
+        self._check_final_health()
+        if not self._is_finished:
+            self._evaluate()
 
     def _take_step(self) -> None:
         started = time.perf_counter()
-        share, scale = self.plan.progress(self.state.step), 0.5**self.state.rollbacks
-        take = partial(self.trainer.step, self.state.step, share, scale)
-        result = observed(take, self.state.step, self.state.timings, self.probes.train.colours.device)
+        progress, lr_scale = self.schedule.progress(self.state.step), 0.5**self.state.rollbacks
+        take = partial(self.trainer.step, self.state.step, progress, lr_scale)
+        result = profiled_step(take, self.state.step, self.state.timings, self.evaluation_sets.train.colours.device)
         seconds = time.perf_counter() - started
         self.state.step += 1
         self.state.seconds += seconds
         self.state.rays += result.rays
-        self.state.samples += result.samples
-        self.pace.add(seconds, result.rays, result.psnr)
+        self.state.colour_evaluations += result.colour_evaluations
+        self.speed.add(seconds, result.rays, result.psnr)
 
     @property
-    def _planning_is_due(self) -> bool:
-        """Every hundredth of the time, and before the last step: it may have been planned when steps took longer."""
-        last = self.state.step >= self.plan.total_steps - 1
-        return self.pace.count > 1 and (last or self.state.seconds >= self.next_planning)
+    def _revision_is_due(self) -> bool:
+        """Every SCHEDULE_TOLERANCE of the time, and before the last step: steps may have become faster."""
+        last = self.state.step >= self.schedule.total_steps - 1
+        return self.speed.count > 1 and (last or self.state.seconds >= self.next_revision)
 
-    def _replan(self, budget: float) -> None:
-        """Fit the number of steps to the time left. Never rewrites a decision (after a roll-back, that is)."""
-        step, tolerance = self.state.step, PLAN_SHARE * (budget - self.state.seconds_before)
-        self.next_planning = self.state.seconds + tolerance
-        self.spent.write_text(f"{self.state.seconds + self.lost:.3f}")
-        last = self.plan.decisions[-1]
-        if not last.from_step <= step < self.plan.total_steps or last.reason == "target":
+    def _revise_schedule(self, budget: float) -> None:
+        """Fit the number of steps to the time left. Never rewrites an earlier revision (after a roll-back)."""
+        step, tolerance = self.state.step, SCHEDULE_TOLERANCE * (budget - self.state.seconds_before)
+        self.next_revision = self.state.seconds + tolerance
+        self.elapsed_file.write_text(f"{self.state.seconds + self.lost:.3f}")
+        last = self.schedule.revisions[-1]
+        if not last.from_step <= step < self.schedule.total_steps or last.reason == "target":
             return
-        plan = replanned(self.plan, step, self.state.seconds, budget, 1 / self.pace.seconds_per_step, tolerance)
-        if plan is not self.plan:
-            self.plan = plan
-            self._write_journal()
-            self.log.event("planned", step, total_steps=plan.total_steps)
+        speed = 1 / self.speed.seconds_per_step
+        schedule = revised_by_clock(self.schedule, step, self.state.seconds, budget, speed, tolerance)
+        if schedule is not self.schedule:
+            self.schedule = schedule
+            self._write_schedule()
+            self.log.event("schedule-revised", step, total_steps=schedule.total_steps)
 
-    def _measure(self) -> None:
-        """Add a point to the curve. Not training time, and without influence on what is trained."""
+    def _evaluate(self) -> None:
+        """Add a point to the curve. It is no training time and does not influence training."""
         load_metrics()
         started = time.perf_counter()
-        seen = look(self.trainer, self.probes.test) if self.probes.test else None
-        # Right after a kill at the very end no step has told how well the batches go.
-        train = self.pace.psnr if self.pace.count else self._on_training_photos().psnr
+        test = evaluate_held_out(self.trainer, self.evaluation_sets.test) if self.evaluation_sets.test else None
+        # Right after a kill at the very end there is no batch PSNR yet.
+        train = self.speed.psnr if self.speed.count else self._evaluate_training().psnr
         point = {"step": self.state.step, "seconds": round(self.state.seconds, 3), "train_psnr": round(train, 3)}
-        point["probe_psnr"] = None if seen is None else round(seen.psnr, 3)
-        point["probe_ssim"] = None if seen is None or seen.ssim is None else round(seen.ssim, 4)
+        point["probe_psnr"] = None if test is None else round(test.psnr, 3)
+        point["probe_ssim"] = None if test is None or test.ssim is None else round(test.ssim, 4)
         self.state.curve.append(point)
         self.log.point(point)
-        if self.probes.target is not None:
-            self._steer(self.probes.target)
-        self._plan_measurement(time.perf_counter() - started)
+        if self.evaluation_sets.target is not None:
+            self._adapt_to_target(self.evaluation_sets.target)
+        self._schedule_evaluation(time.perf_counter() - started)
 
     @property
     def _elapsed(self) -> float:
-        """What measurements are spaced by: steps where these are counted, so that nothing depends on the clock."""
+        """What spaces the evaluations: steps of a run in steps, which must not depend on the clock, else seconds."""
         return self.state.seconds if self.budget.steps is None else float(self.state.step)
 
-    def _plan_measurement(self, cost: float = 0.0) -> None:
-        """Decide when to measure next; the last time took ``cost`` seconds."""
-        growth = MEASUREMENT_GROWTH if self.probes.target is None else TARGET_GROWTH
+    def _schedule_evaluation(self, cost: float = 0.0) -> None:
+        """Decide when to evaluate next; the last evaluation took ``cost`` seconds."""
+        growth = EVALUATION_GROWTH if self.evaluation_sets.target is None else TARGET_EVALUATION_GROWTH
         kind = "seconds" if self.budget.steps is None else "steps"
-        self.next_measurement = next_in_series(self._elapsed, FIRST_MEASUREMENT[kind], growth)
+        self.next_evaluation = next_in_series(self._elapsed, FIRST_EVALUATION[kind], growth)
         if kind == "seconds":
-            self.next_measurement = max(self.next_measurement, self._elapsed + cost / MAX_MEASURING)
+            self.next_evaluation = max(self.next_evaluation, self._elapsed + cost / MAX_EVALUATION_FRACTION)
 
-    def _steer(self, target: Target) -> None:
-        """Stop where the validation photos are as good as wanted; anneal where that may be all it takes; go on as
-        before where it was not enough and there is time. Decisions already in the plan are not made again."""
-        step, decided = self.state.step, self.plan.decisions[-1]
-        self.state.validation_psnr = round(look(self.trainer, target.photos).psnr, 3)
+    def _adapt_to_target(self, target: Target) -> None:
+        """Stop if the validation photos reach the target; begin the decay phase if that may be enough; train on if it
+        was not and there is time. Revisions already in the schedule are not made again."""
+        step, last = self.state.step, self.schedule.revisions[-1]
+        self.state.validation_psnr = round(evaluate_held_out(self.trainer, target.held_out).psnr, 3)
         self.log.event("validated", step, psnr=self.state.validation_psnr)
-        if step <= decided.from_step or self.state.open_target(target.psnr) is None:
+        if step <= last.from_step or self.state.pending_target(target.psnr) is None:
             return
-        own = (decision for decision in self.plan.decisions if decision.from_step > self.state.steps_before)
-        failed = sum(decision.reason == "target" for decision in own)
+        own = (revision for revision in self.schedule.revisions if revision.from_step > self.state.steps_before)
+        failed = sum(revision.reason == "target" for revision in own)
         missing = target.psnr - self.state.validation_psnr
-        plan = self.plan
+        schedule = self.schedule
         if missing <= 0:
-            plan = plan.ended(step)
-        elif step == plan.total_steps:
-            if decided.reason == "target" and self._most_steps() > step:
-                plan = plan.extended(self._most_steps())
-        elif missing <= ANNEALING_DB / 2**failed and plan.progress(step) < CLOSING_SHARE:
-            plan = plan.closing(step)
-        if plan is not self.plan:
-            self.plan = plan
-            self._write_journal()
-            self.log.event("steered", step, total_steps=plan.total_steps)
-            if plan.total_steps > step:
-                self.progress.note("train.target-steering", steering_words(self.state, target.psnr, plan))
+            schedule = schedule.ended_at(step)
+        elif step == schedule.total_steps:
+            if last.reason == "target" and self._max_steps() > step:
+                schedule = schedule.extended_to(self._max_steps())
+        elif missing <= DECAY_GAIN_DB / 2**failed and schedule.progress(step) < DECAY_START_PROGRESS:
+            schedule = schedule.with_decay_from(step)
+        if schedule is not self.schedule:
+            self.schedule = schedule
+            self._write_schedule()
+            self.log.event("target-revision", step, total_steps=schedule.total_steps)
+            if schedule.total_steps > step:
+                self.progress.note("train.target-revision", target_revision_message(self.state, target.psnr, schedule))
 
-    def _most_steps(self) -> int:
+    def _max_steps(self) -> int:
         """How many steps the budget allows for."""
-        steps, seconds = self._limits()
+        steps, seconds = self._budget_limits()
         if steps is not None:
             return steps
         assert seconds is not None, "one of the two is given"
-        per_step = self.pace.seconds_per_step or self.state.seconds / self.state.step
+        per_step = self.speed.seconds_per_step or self.state.seconds / self.state.step
         return self.state.step + int((seconds - self.state.seconds) / per_step)
 
     def _save(self) -> None:
         started = time.monotonic()
         save_checkpoint(self.checkpoints, Checkpoint(self.state.step, self.trainer.state(), asdict(self.state)))
-        self._plan_checkpoint(time.monotonic() - started)
+        self._schedule_checkpoint(time.monotonic() - started)
 
-    def _plan_checkpoint(self, cost: float = 0.0) -> None:
+    def _schedule_checkpoint(self, cost: float = 0.0) -> None:
         self.next_checkpoint = time.monotonic() + (self.checkpoint_seconds or checkpoint_interval(self.budget, cost))
 
-    def _write_journal(self) -> None:
-        write_durably(self.journal, json.dumps(self.plan.decisions).encode())
+    def _write_schedule(self) -> None:
+        write_durably(self.schedule_file, json.dumps(self.schedule.revisions).encode())
 
-    def _examine(self) -> None:
-        """Before the state is kept: raise Lost where it is not finite or, the warm-up being over, the field is dead."""
-        if name := not_finite(self.trainer):
-            raise Lost(f"after {self.state.step:,} steps the field is lost: its {name} is not finite")
-        if self.state.step > WARM_UP_STEPS and is_suspicious(self.pace.psnr, self.probes.train):
-            self._examine_fully()
+    def _check_health(self) -> None:
+        """Before the state is saved: raise TrainingFailure if it is not finite or, from MIN_HEALTHY_STEPS on, the field
+        has collapsed."""
+        if name := non_finite_tensor(self.trainer):
+            raise TrainingFailure(f"after {self.state.step:,} steps the field has diverged: its {name} is not finite")
+        if self.state.step > MIN_HEALTHY_STEPS and needs_full_check(self.speed.psnr, self.evaluation_sets.train):
+            self._check_health_fully()
 
-    def _examine_at_the_end(self) -> None:
-        self._examine()
-        self.state.symptom = None
-        if self.state.step >= WARM_UP_STEPS:
-            self._examine_fully()
-        elif symptom := symptom_of(self.trainer, self.probes.train):
-            self.state.symptom = symptom
-            self.log.event("unripe", self.state.step, symptom=symptom)
+    def _failure_reason(self) -> str | None:
+        return failure_reason(self.trainer, self.evaluation_sets.train)
+
+    def _check_final_health(self) -> None:
+        self._check_health()
+        self.state.failure_reason = None
+        if self.state.step >= MIN_HEALTHY_STEPS:
+            self._check_health_fully()
+        elif reason := self._failure_reason():
+            self.state.failure_reason = reason
+            self.log.event("undertrained", self.state.step, reason=reason)
             self.progress.note(
                 "train.undertrained",
-                f"after {self.state.step:,} steps the field is of no use yet: {symptom}; train longer",
+                f"after {self.state.step:,} steps the field is undertrained: {reason}; train longer",
             )
 
-    def _examine_fully(self) -> None:
-        if symptom := symptom_of(self.trainer, self.probes.train):
-            raise Lost(f"after {self.state.step:,} steps the field is lost: {symptom}")
+    def _check_health_fully(self) -> None:
+        if reason := self._failure_reason():
+            raise TrainingFailure(f"after {self.state.step:,} steps the field has collapsed: {reason}")
 
-    def _roll_back(self, fault: NonFinite | Lost) -> None:
-        """Keep the batch, return to the last good checkpoint and halve the rate; give up by name after the third."""
-        hint = self._on_record(fault)
+    def _roll_back(self, failure: NonFinite | TrainingFailure) -> None:
+        """Keep the batch, return to the last good checkpoint and halve the learning rate. Raises StageError after
+        MAX_ROLLBACKS."""
+        hint = self._log_failure(failure)
         rollbacks = self.state.rollbacks + 1
         if rollbacks > MAX_ROLLBACKS:
-            why = f"{fault}, after {MAX_ROLLBACKS} roll-backs that each halved the learning rate"
+            why = f"{failure}, after {MAX_ROLLBACKS} roll-backs that each halved the learning rate"
             raise StageError("train.diverged", "training diverged", why, hint)
-        checkpoint = latest_checkpoint(self.checkpoints, self.progress.note, self._load_sound)
+        checkpoint = latest_checkpoint(self.checkpoints, self.progress.note, self._load_healthy)
         if checkpoint is None and self.budget.after is not None:
-            self._go_on(self.budget.after)
+            self._extend(self.budget.after)
             self.state.rollbacks = rollbacks
         elif checkpoint is None:
-            self._begin(self.state.anew(self.state.restarts, rollbacks))
+            self._start(self.state.restarted(self.state.restarts, rollbacks))
         else:
             self.state.step, self.state.rollbacks = checkpoint.step, rollbacks
             self.state.curve = [point for point in self.state.curve if point["step"] <= checkpoint.step]
-            self._plan_measurement()
-        self.progress.note("train.rolled-back", f"{fault}: back to step {self.state.step:,} at half the learning rate")
+            self._schedule_evaluation()
+        self.progress.note(
+            "train.rolled-back", f"{failure}: back to step {self.state.step:,} at half the learning rate"
+        )
 
-    def _load_sound(self, checkpoint: Checkpoint) -> None:
-        """Go back to it. Raises Lost where the field was dead already, as its batches tell only seconds later."""
+    def _load_healthy(self, checkpoint: Checkpoint) -> None:
+        """Restore it. Raises TrainingFailure if its field had collapsed: the batch PSNR shows that only seconds
+        later."""
         self.trainer.load_state(checkpoint.tensors)
-        if checkpoint.step > WARM_UP_STEPS and (symptom := symptom_of(self.trainer, self.probes.train)):
-            raise Lost(symptom)
+        if checkpoint.step > MIN_HEALTHY_STEPS and (reason := self._failure_reason()):
+            raise TrainingFailure(reason)
 
-    def _on_record(self, fault: NonFinite | Lost) -> str:
-        """Log the fault, and keep the batch of one that has it; what the user may try."""
+    def _log_failure(self, failure: NonFinite | TrainingFailure) -> str:
+        """Log the failure and save the batch of a non-finite one; returns what the user may try."""
         slower = "Try a tenth of --train.learning-rate"
-        if isinstance(fault, Lost):
-            self.log.event("lost", self.state.step, symptom=str(fault))
+        if isinstance(failure, TrainingFailure):
+            self.log.event("failed", self.state.step, reason=str(failure))
             return f"{slower}."
-        name = f"nonfinite_{fault.step}.safetensors"
-        (self.folder / name).write_bytes(save({key: tensor.contiguous() for key, tensor in fault.batch.items()}))
-        self.log.event("nonfinite", fault.step, quantity=fault.quantity, batch=name)
-        advice = "Check the cameras, which give the rays" if fault.quantity == RAYS else slower
+        name = f"nonfinite_{failure.step}.safetensors"
+        (self.folder / name).write_bytes(save({key: tensor.contiguous() for key, tensor in failure.batch.items()}))
+        self.log.event("nonfinite", failure.step, quantity=failure.quantity, batch=name)
+        advice = "Check the cameras, which give the rays" if failure.quantity == RAY_GEOMETRY else slower
         return f"{advice}; the batch is kept in {self.folder / name}."
 
-    def _on_training_photos(self) -> ProbeResult:
-        return measure(self.trainer.model, self.probes.train, self.trainer.effects)
+    def _evaluate_training(self) -> PixelEvaluation:
+        return evaluate(self.trainer.model, self.evaluation_sets.train, self.trainer.effects)
 
-    def _restart(self, symptom: str) -> None:
-        """Begin anew with another seed; give up by name after the second."""
-        self.log.event("dead", self.state.step, symptom=symptom)
+    def _restart(self, reason: str) -> None:
+        """Restart with another seed. Raises StageError after MAX_RESTARTS."""
+        self.log.event("collapsed", self.state.step, reason=reason)
         restarts = self.state.restarts + 1
         if restarts > MAX_RESTARTS:
-            why = f"after {WARM_UP_STEPS} steps {symptom}, with {restarts} different seeds"
+            why = f"after {MIN_HEALTHY_STEPS} steps {reason}, with {restarts} different seeds"
             hint = "Check the cameras: the photos may not fit their poses. Or try a tenth of --train.learning-rate."
             raise StageError("train.collapsed", "the field does not learn", why, hint)
         self.progress.note(
-            "train.restarted", f"after {WARM_UP_STEPS} steps the field is dead: {symptom}; starting with another seed"
+            "train.restarted",
+            f"after {MIN_HEALTHY_STEPS} steps the field has collapsed: {reason}; restarting with another seed",
         )
         shutil.rmtree(self.checkpoints)
-        self._begin(self.state.anew(restarts, rollbacks=0))
+        self._start(self.state.restarted(restarts, rollbacks=0))
 
-    def _describe(self) -> tuple[str, float]:
-        """The live line, and the share of the run that is done."""
-        if not self.pace.count:
+    def _progress_line(self) -> tuple[str, float]:
+        """The live line, and the progress of the run."""
+        if not self.speed.count:
             return "first step", 0.0
-        left = (self.plan.total_steps - self.state.step) * self.pace.seconds_per_step
+        left = (self.schedule.total_steps - self.state.step) * self.speed.seconds_per_step
         if self.clock_budget is not None:
             left = max(0.0, self.clock_budget - self.state.seconds)
-        return live_words(self.state, self.pace, left), self.plan.progress(self.state.step)
+        return speed_message(self.state, self.speed, left), self.schedule.progress(self.state.step)
 
 
-def live_words(state: RunState, pace: Pace, left: float) -> str:
-    """Step, speed, quality and the seconds left; of a run that knows its pace."""
-    measured = [point["probe_psnr"] for point in state.curve if point["probe_psnr"] is not None]
-    test = f" · {measured[-1]:.1f} dB on test pixels" if measured else ""
-    speed = f"{short_count(pace.rays_per_step / pace.seconds_per_step)} rays/s"
-    return f"step {state.step:,} · {speed} · train {pace.psnr:.1f} dB{test} · {left:.0f} s left"
+def speed_message(state: RunState, speed: TrainingSpeed, left: float) -> str:
+    """Step, speed, quality and the seconds left of a run whose speed is known."""
+    known = [point["probe_psnr"] for point in state.curve if point["probe_psnr"] is not None]
+    test = f" · {known[-1]:.1f} dB on test pixels" if known else ""
+    rays = f"{short_count(speed.rays_per_step / speed.seconds_per_step)} rays/s"
+    return f"step {state.step:,} · {rays} · train {speed.psnr:.1f} dB{test} · {left:.0f} s left"
 
 
-def going_on_words(step: int, total_steps: int, left: float | None) -> str:
-    """After a kill; ``left``: seconds, where it is these that count."""
-    much = f" of {total_steps:,}" if left is None else f", with {max(0.0, left):.0f} s of training left"
-    return f"going on from step {step:,}{much}"
+def resumed_message(step: int, total_steps: int, left: float | None) -> str:
+    """After a kill; ``left``: the seconds left of a run in seconds."""
+    rest = f" of {total_steps:,}" if left is None else f", with {max(0.0, left):.0f} s of training left"
+    return f"resuming from step {step:,}{rest}"
 
 
-def lost_words(seconds: float) -> str | None:
-    """What a kill cost; None where it is next to nothing."""
-    return (
-        f"{seconds:.0f} s of training after the last checkpoint are lost, and count as spent" if seconds >= 1 else None
-    )
+def lost_time_message(seconds: float) -> str | None:
+    """What a kill cost; None below a second."""
+    if seconds < 1:
+        return None
+    return f"{seconds:.0f} s of training after the last checkpoint are lost and count as spent"
 
 
-def reached_before_words(target_psnr: float) -> str:
-    """That a target which a finished run has reached does not end the one that goes on from it."""
-    return f"{target_psnr:g} dB are reached already: training goes on for all that was asked for"
+def target_already_reached_message(target_psnr: float) -> str:
+    """That a target which the finished run has reached does not end its continuation."""
+    return f"{target_psnr:g} dB are reached already: training uses the whole additional budget"
 
 
-def steering_words(state: RunState, target_psnr: float, plan: StepSchedule) -> str:
-    """That the rate falls before the end, or goes back up, with a target in mind."""
-    seen = f"{state.validation_psnr:.1f} of {target_psnr:g} dB on validation photos after {state.step:,} steps"
-    and_now = "annealing over" if plan.decisions[-1].reason == "target" else "going on for"
-    return f"{seen}: {and_now} {plan.total_steps - state.step:,} more"
+def target_revision_message(state: RunState, target_psnr: float, schedule: StepSchedule) -> str:
+    """That the learning rate decays before the end, or goes back up, to reach a target."""
+    quality = f"{state.validation_psnr:.1f} of {target_psnr:g} dB on validation photos after {state.step:,} steps"
+    steps = f"{schedule.total_steps - state.step:,} more steps"
+    if schedule.revisions[-1].reason == "target":
+        return f"{quality}: the learning rate decays over {steps}"
+    return f"{quality}: training continues for {steps}"

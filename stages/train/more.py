@@ -1,21 +1,21 @@
-"""Going on from the end of a finished training: with its settings, photos and cameras, for longer.
+"""Continuing a finished training: with its settings, photos and cameras, for longer.
 
 A training is named ``<key>/<digest>``: the first KEY_LENGTH digits of its key, which name its folder in the
 workspace, and of the digest of its outputs. So the name says what was trained and not where it lies.
 """
 
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any
 
-from stages.contract import KEY_LENGTH, Inputs, StageError
+from stages.contract import KEY_LENGTH, Inputs, Options, StageError
 from stages.io.files import read_json
 from stages.train.config import Config
 from stages.train.state import TrainingBudget
 
-OWN = ("after", "more_steps", "more_seconds")
-# Replaced by the budget for more; or without influence on what is trained.
-FREE = (*OWN, "steps", "seconds", "preset", "checkpoint_seconds", "tensorboard")
-ANEW = "Give --train.seconds or --train.steps to train anew."
+MORE_OPTIONS = ("after", "more_steps", "more_seconds")
+# Replaced by the additional budget, or without influence on the field.
+IGNORED_OPTIONS = (*MORE_OPTIONS, "steps", "seconds", "preset", "checkpoint_seconds", "tensorboard")
+RESTART_HINT = "Train from the start with --train.seconds or --train.steps."
 
 
 def training_name(key: str, outputs_digest: str) -> str:
@@ -23,69 +23,76 @@ def training_name(key: str, outputs_digest: str) -> str:
     return f"{key[:KEY_LENGTH]}/{outputs_digest[:KEY_LENGTH]}"
 
 
-def cannot_go_on(code: str, why: str) -> StageError:
-    """The error for a finished training whose last state is of no use here."""
-    return StageError(code, "training cannot go on", why, "Train anew, for longer, without --more.")
+def cannot_continue(code: str, why: str) -> StageError:
+    """The error for a finished training whose last checkpoint is of no use here."""
+    return StageError(code, "cannot continue training", why, "Train from the start, for longer, without --more.")
 
 
-def earlier_training(name: str, inputs: Inputs) -> Path:
+def finished_training_folder(name: str, inputs: Inputs) -> Path:
     """The folder of a finished training in the workspace of ``inputs``.
 
-    Raises StageError where it is gone, or has been made again and become another.
+    Raises StageError if it is gone, or was trained again with another result.
     """
     key, digest = name.split("/")
     folder = inputs["effects"].parents[1] / "train" / key
-    what = "training cannot go on"
+    what = "cannot continue training"
     if not (folder / "manifest.json").is_file():
-        raise StageError("train.training-gone", what, f"the training that it goes on from, {folder}, is gone", ANEW)
+        raise StageError("train.training-gone", what, f"the finished training {folder} is gone", RESTART_HINT)
     if not read_json(folder / "manifest.json")["outputs_digest"].startswith(digest):
         raise StageError(
             "train.training-changed",
             what,
-            f"{folder} was trained again since and is another field now",
+            f"{folder} has been trained again since and is another field now",
             "Give --more again.",
         )
     return folder
 
 
 def continued(config: Config, inputs: Inputs) -> Config:
-    """The settings of the training that ``config`` goes on from, with the budget for more.
+    """The settings of the training that ``config`` continues, with the additional budget.
 
-    Raises StageError where the two do not go together: photos, cameras or settings have changed.
+    Raises StageError if photos, cameras or settings have changed.
     """
     assert config.after is not None
-    manifest = read_json(earlier_training(config.after, inputs) / "manifest.json")
+    manifest = read_json(finished_training_folder(config.after, inputs) / "manifest.json")
     _same_inputs(manifest["inputs"], inputs)
-    settings: dict[str, Any] = manifest["config"]
-    given = {name: value for name, value in config.model_dump(mode="json").items() if value is not None}
-    free = {*FREE, "target_psnr"} if settings["target_psnr"] is not None else FREE
-    for name, value in given.items():
-        if name not in free and value != settings.get(name):
-            why = f"{name} is {value} now and was {settings.get(name)}"
-            raise StageError("train.other-settings", "training cannot go on with other settings", why, ANEW)
-    own = {name: getattr(config, name) for name in (*OWN, "checkpoint_seconds", "tensorboard")}
-    target = {"target_psnr": config.target_psnr or settings["target_psnr"]}
-    return Config.model_validate(settings | own | target)
+    before = Config.model_validate(manifest["config"])
+    free = {*IGNORED_OPTIONS, "target_psnr"} if before.target_psnr is not None else {*IGNORED_OPTIONS}
+    if (why := next(_changes(config, before, free), None)) is not None:
+        raise StageError("train.other-settings", "cannot continue training with other settings", why, RESTART_HINT)
+    own = {name: getattr(config, name) for name in (*MORE_OPTIONS, "checkpoint_seconds", "tensorboard")}
+    target = {"target_psnr": config.target_psnr or before.target_psnr}
+    return Config.model_validate(manifest["config"] | own | target)
+
+
+def _changes(now: Options, before: Options, free: Collection[str] = (), prefix: str = "") -> Iterator[str]:
+    """Every option, except the ``free`` ones, that is given ``now`` and was another ``before``, as a sentence."""
+    for name in type(now).model_fields.keys() - {*free}:
+        value, was = getattr(now, name), getattr(before, name)
+        if isinstance(value, Options):
+            yield from _changes(value, was, prefix=f"{name}.")
+        elif value is not None and value != was:
+            yield f"{prefix}{name} is {value} now and was {was}"
 
 
 def _same_inputs(digests: dict[str, str], inputs: Inputs) -> None:
     now = {stage: read_json(inputs[stage] / "manifest.json")["outputs_digest"] for stage in digests}
     if changed := [stage for stage in digests if digests[stage] != now[stage]]:
-        why = f"what it was trained on has changed since: {', '.join(changed)}"
-        raise StageError("train.other-photos", "training cannot go on", why, ANEW)
+        why = f"its inputs have changed since: {', '.join(changed)}"
+        raise StageError("train.other-photos", "cannot continue training", why, RESTART_HINT)
 
 
 def earlier_seconds(config: Config, inputs: Inputs) -> float:
-    """What the trainings that ``config`` goes on from took as stages, each with all that comes before and after its
-    steps; 0 where it begins anew."""
+    """The wall time of the trainings that ``config`` continues, as stages: reading, steps, saving; 0 for a new
+    training."""
     if config.after is None:
         return 0.0
-    manifest = read_json(earlier_training(config.after, inputs) / "manifest.json")
+    manifest = read_json(finished_training_folder(config.after, inputs) / "manifest.json")
     return manifest["seconds"] + manifest["facts"].get("earlier_seconds", 0.0)
 
 
 def budget_of(config: Config, inputs: Inputs) -> TrainingBudget:
-    """How long to train, and from where on."""
+    """How long to train, and which finished run to continue."""
     if config.after is None:
         return TrainingBudget(config.steps, config.seconds)
-    return TrainingBudget(config.more_steps, config.more_seconds, earlier_training(config.after, inputs))
+    return TrainingBudget(config.more_steps, config.more_seconds, finished_training_folder(config.after, inputs))

@@ -21,8 +21,8 @@ from stages.io.files import read_json, read_scene
 from stages.io.photos import read_photos
 from stages.train.config import SECONDS, Config
 from stages.train.data import MIN_LONG_SIDE, camera_directions
-from stages.train.fields import field_of, make_trainer
-from stages.train.more import continued, earlier_training
+from stages.train.fields.field_list import field_of, make_trainer
+from stages.train.more import continued, finished_training_folder
 from stages.train.precision import chosen_precision
 
 if TYPE_CHECKING:
@@ -158,19 +158,19 @@ def larger_photos_words(config: Config, inputs: Inputs, scene: "Scene", used: Ma
     """That as long a training from the start would take photos larger by more than MIN_NAMED_GAIN than those of
     ``config``, which goes on with what it has; None where it would not. ``used``: as for :func:`chosen_downscale`."""
     assert config.after is not None and config.downscale is not None, "continued() has them"
-    folder = earlier_training(config.after, inputs)
+    folder = finished_training_folder(config.after, inputs)
     before = read_json(folder / "field.json")
     if config.more_steps is not None:
         steps = before["steps"] + config.more_steps
-        longer, much, anew = steps / before["steps"], f"{steps:,} steps", f"--train.steps {steps}"
+        longer, much, command = steps / before["steps"], f"{steps:,} steps", f"--train.steps {steps}"
     else:
         assert config.more_seconds is not None, "one of the two is given"
         trained = read_json(folder / "manifest.json")["facts"]["train_seconds"]
         seconds = trained + config.more_seconds
         longer, much = seconds / trained, duration(seconds)
-        anew = f"--train.seconds {seconds:.0f}, or a larger --budget,"
+        command = f"--train.seconds {seconds:.0f}, or a larger --budget,"
     would = chosen_downscale(scene, before["steps"] * field_of(config).rays_per_step(config) * longer, used)
     if config.downscale <= (1 + MIN_NAMED_GAIN) * would:
         return None
     stay = f"photos stay at 1/{config.downscale:g} of their size and the field as large as it is"
-    return f"{stay}; {much} from the start would have them at 1/{would:g}: {anew} trains anew"
+    return f"{stay}; {much} from the start would have them at 1/{would:g}: {command} trains anew"

@@ -8,11 +8,11 @@ from typing import Any
 
 import torch
 
-from nerf.runtime.matmul_precision import Medium, Precision, measure_medium_matmul
+from nerf.runtime.matmul_precision import MediumPrecision, Precision, measure_medium_matmul
 from stages.contract import Progress
 from stages.hardware.device import compute_device
 from stages.train.config import Config
-from stages.train.fields import field_of
+from stages.train.fields.field_list import field_of
 
 
 def chosen_precision(config: Config, progress: Progress) -> Precision:
@@ -20,7 +20,7 @@ def chosen_precision(config: Config, progress: Progress) -> Precision:
     if config.steps is not None:
         return "highest"
     medium = _medium(config)
-    if not medium.pays:
+    if not medium.is_worthwhile:
         return "highest"
     progress.note(
         "train.matmul-medium",
@@ -49,6 +49,6 @@ def precision_facts(config: Config) -> dict[str, Any]:
     }
 
 
-def _medium(config: Config) -> Medium:
+def _medium(config: Config) -> MediumPrecision:
     """Measured at the width of the field's networks."""
     return measure_medium_matmul(torch.device(compute_device()), field_of(config).matmul_width(config))

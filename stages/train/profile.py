@@ -1,7 +1,7 @@
-"""Where the time of a training run goes, part by part, and how near that is to what this machine can do.
+"""Where the time of a training run goes, span by span, and how near that is to what this machine can do.
 
-One step in a few is timed as it is taken (nerf/runtime/profiler.py): the same kernels in the same order, so nothing of
-the result depends on it. At the end the machine's own rates are measured, and the work of each part set against them.
+One step in PROFILE_INTERVAL is profiled (nerf/runtime/profiler.py): the same kernels in the same order, so the result
+does not depend on it. At the end the machine's own rates are measured and compared with the work of each span.
 """
 
 import time
@@ -17,67 +17,73 @@ from nerf.runtime.profiler import Profiler, WorkCounts, profiling
 from nerf.training.trainer import StepResult
 from stages.io.files import write_json
 from stages.train.config import Config
-from stages.train.fields import field_of
+from stages.train.fields.field_list import field_of
 
-TIMED_EVERY, FIRST_TIMED = 32, 8  # steps: one of so many is timed; the very first ones are unlike the others
+PROFILE_INTERVAL, FIRST_PROFILED_STEP = 32, 8  # the very first steps are unlike the others
 RATES_SECONDS = 0.5  # to measure the machine's rates in, once training has ended
-PARTS_FILE = "profile.json"
-WAITING = "waiting"
+PROFILE_FILE = "profile.json"
+IDLE = "idle"
 
 
-def observed(take: Callable[[], StepResult], step: int, timings: dict[str, Any], device: torch.device) -> StepResult:
-    """Take a step; if its turn has come, add what it did to ``timings``: JSON values, empty at first."""
-    if step % TIMED_EVERY != FIRST_TIMED:
+def profiled_step(
+    take: Callable[[], StepResult], step: int, timings: dict[str, Any], device: torch.device
+) -> StepResult:
+    """Take a step. Profile it if it is due, and add its profile to ``timings``: JSON values, empty at first."""
+    if step % PROFILE_INTERVAL != FIRST_PROFILED_STEP:
         return take()
     profiler, started = Profiler(device), time.perf_counter()
     with profiling(profiler):
         result = take()
     seconds = time.perf_counter() - started
     cores = workers() if device.type == "cpu" else 1
-    amounts = {"steps": 1, "rays": result.rays, "samples": result.samples, "densities": result.densities}
+    amounts = {
+        "steps": 1,
+        "rays": result.rays,
+        "colour_evaluations": result.colour_evaluations,
+        "density_evaluations": result.density_evaluations,
+    }
     for name, amount in (amounts | {"seconds": seconds, "core_seconds": cores * seconds}).items():
         timings[name] = timings.get(name, 0) + amount
-    parts = timings.setdefault("parts", {})
-    for name, spent in profiler.spans.items():
-        parts[name] = [a + b for a, b in zip(parts.get(name, [0.0] * 4), (spent.seconds, *spent.work), strict=True)]
+    spans = timings.setdefault("spans", {})
+    for name, total in profiler.spans.items():
+        spans[name] = [a + b for a, b in zip(spans.get(name, [0.0] * 4), (total.seconds, *total.work), strict=True)]
     return result
 
 
-def parts_table(timings: dict[str, Any], rates: Rates) -> dict[str, Any]:
-    """The content of profile.json, from what :func:`observed` noted of at least one step.
+def profile_table(timings: dict[str, Any], rates: Rates) -> dict[str, Any]:
+    """The content of profile.json, from the ``timings`` of at least one :func:`profiled_step`.
 
-    ``samples`` are points whose colour was computed, ``densities`` points whose density was asked for.
-    Shares are of the cores' time, and sum to 1: what no core computed is ``waiting``. ``floor`` is the time that a
-    part's work takes at ``rates``; null for parts whose work is not of that kind. ``floor_share`` is of what was
-    computed.
+    Each span's ``share`` is of the cores' time; shares sum to 1, the time in which no core computed being ``idle``.
+    ``min_seconds`` is the time that a span's work takes at ``rates``; null for spans without counted work.
+    ``efficiency`` is the sum of all min_seconds over the time computed.
     """
-    spent = {name: (seconds, rates.seconds(WorkCounts(*work))) for name, (seconds, *work) in timings["parts"].items()}
-    busy, floor = (sum(column) for column in zip(*spent.values(), strict=True))
-    whole = max(timings["core_seconds"], busy)
-    spent[WAITING] = (whole - busy, 0.0)
-    ordered = sorted(spent.items(), key=lambda entry: -entry[1][0])
+    spans = {name: (seconds, rates.seconds(WorkCounts(*work))) for name, (seconds, *work) in timings["spans"].items()}
+    busy, minimum = (sum(column) for column in zip(*spans.values(), strict=True))
+    total = max(timings["core_seconds"], busy)
+    spans[IDLE] = (total - busy, 0.0)
+    ordered = sorted(spans.items(), key=lambda entry: -entry[1][0])
     return {
-        "steps_timed": timings["steps"],
-        **{name: timings[name] for name in ("rays", "samples", "densities")},
+        "profiled_steps": timings["steps"],
+        **{name: timings[name] for name in ("rays", "colour_evaluations", "density_evaluations")},
         "seconds": round(timings["seconds"], 4),
-        "core_seconds": round(whole, 4),
+        "core_seconds": round(total, 4),
         "rates": {name: round(rate) for name, rate in rates._asdict().items()},
-        "parts": [_row(name, seconds, least, whole) for name, (seconds, least) in ordered],
-        "floor_share": round(floor / busy, 4),
-        "most_rays_per_second": round(timings["rays"] / timings["seconds"] * whole / floor, 1) if floor else None,
+        "spans": [_row(name, seconds, least, total) for name, (seconds, least) in ordered],
+        "efficiency": round(minimum / busy, 4),
+        "max_rays_per_second": round(timings["rays"] / timings["seconds"] * total / minimum, 1) if minimum else None,
     }
 
 
-def write_parts(folder: Path, timings: dict[str, Any], config: Config, device: torch.device) -> list[str]:
+def write_profile(folder: Path, timings: dict[str, Any], config: Config, device: torch.device) -> list[str]:
     """Measure the machine and write profile.json; the names of the files written: none where no step was timed."""
     if not timings:
         return []
     field = field_of(config)
     rates = measure_rates(device, field.matmul_width(config), field.table_rows(config), RATES_SECONDS)
-    write_json(folder / PARTS_FILE, parts_table(timings, rates))
-    return [PARTS_FILE]
+    write_json(folder / PROFILE_FILE, profile_table(timings, rates))
+    return [PROFILE_FILE]
 
 
-def _row(name: str, seconds: float, floor: float, whole: float) -> dict[str, Any]:
-    row = {"part": name, "seconds": round(seconds, 4), "share": round(seconds / whole, 4)}
-    return row | {"floor": round(floor, 4) if floor else None}
+def _row(name: str, seconds: float, min_seconds: float, total: float) -> dict[str, Any]:
+    row = {"span": name, "seconds": round(seconds, 4), "share": round(seconds / total, 4)}
+    return row | {"min_seconds": round(min_seconds, 4) if min_seconds else None}

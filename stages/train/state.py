@@ -1,4 +1,4 @@
-"""What a training run is given and what it keeps: budget, probes, state, pace, log."""
+"""What a training run is given and what it keeps: budget, evaluation sets, state, speed, log."""
 
 import json
 import math
@@ -9,93 +9,92 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from stages.contract import StageError
 
 if TYPE_CHECKING:
-    from nerf.training.validation_probe import Probe
-    from stages.train.validation_images import Target, Unseen
+    from nerf.training.evaluation_pixels import EvaluationPixels
+    from stages.train.validation_images import HeldOutEvaluation, Target
 
-RATE_MEMORY_SECONDS = 5.0  # how far back the measured speed and the shown PSNR look
-# Between checkpoints: at most this. Of a run in seconds a twentieth of them, if saving takes no more than a hundredth.
-CHECKPOINT_SECONDS, CHECKPOINT_SHARE, MAX_SAVING = 30.0, 0.05, 0.01
-MAX_OF_A_STALL = 3.0  # of the pace: as much of a longer step counts. A machine that sleeps for seconds is not slower
+SPEED_AVERAGING_SECONDS = 5.0  # of the speed and the batch PSNR that are shown
+# Between checkpoints, at most; of a run in seconds a twentieth of them, but saving takes no more than a hundredth.
+CHECKPOINT_SECONDS, CHECKPOINT_FRACTION, MAX_SAVING_FRACTION = 30.0, 0.05, 0.01
+MAX_STEP_SLOWDOWN = 3.0  # a longer step counts as so many mean ones: a machine that sleeps is not slower
 
 
 class TrainingBudget(NamedTuple):
     """How long to train: exactly one of the first two is given. Seconds count training steps alone. ``after``: the
-    folder of a finished run from whose end to go on; the budget is then for what comes on top."""
+    folder of a finished run to continue; the budget is then for the additional steps."""
 
     steps: int | None
     seconds: float | None
     after: Path | None = None
 
 
-class Probes(NamedTuple):
-    """Fixed pixels to measure on; ``test`` is None without test photos, is reported and decides nothing. A
-    ``target`` decides when to stop."""
+class EvaluationSets(NamedTuple):
+    """Fixed pixels to evaluate on: of training photos (health checks), of ``test`` photos (reported, deciding nothing;
+    None without any), and of validation photos with a ``target`` at which to stop."""
 
-    train: "Probe"
-    test: "Unseen | None" = None
+    train: "EvaluationPixels"
+    test: "HeldOutEvaluation | None" = None
     target: "Target | None" = None
 
 
 @dataclass
 class RunState:
-    """What a checkpoint keeps beside the tensors. ``seconds``, ``rays`` and ``samples`` include what was discarded, and
-    what was done before in the finished run that this one goes on from."""
+    """What a checkpoint keeps beside the tensors. ``seconds``, ``rays`` and ``colour_evaluations`` include steps that
+    were rolled back, and those of the finished run that this one continues."""
 
     step: int = 0
     seconds: float = 0.0
     rays: int = 0
-    samples: int = 0
+    colour_evaluations: int = 0
     restarts: int = 0
     rollbacks: int = 0
     curve: list[dict[str, Any]] = field(default_factory=list)
     validation_psnr: float | None = None
-    steps_before: int = 0  # of the finished run that this one goes on from
+    steps_before: int = 0  # of the finished run that this one continues
     seconds_before: float = 0.0
     validation_before: float | None = None
     timings: dict[str, Any] = field(default_factory=dict)
-    symptom: str | None = None  # of a field that ended within its warm-up
+    failure_reason: str | None = None  # of an undertrained field
 
-    def anew(self, restarts: int, rollbacks: int) -> "RunState":
-        """The state of a run that begins again with fresh weights: only what was spent is kept, and what was before."""
-        names = ("seconds", "rays", "samples", "steps_before", "seconds_before", "validation_before")
+    def restarted(self, restarts: int, rollbacks: int) -> "RunState":
+        """The state of a restarted run with fresh weights: it keeps only what was spent, and what was before."""
+        names = ("seconds", "rays", "colour_evaluations", "steps_before", "seconds_before", "validation_before")
         return RunState(restarts=restarts, rollbacks=rollbacks, **{name: getattr(self, name) for name in names})
 
-    def open_target(self, psnr: float | None) -> float | None:
-        """The target, unless the finished run that this one goes on from has reached it: more was asked for since."""
+    def pending_target(self, psnr: float | None) -> float | None:
+        """The target, unless the finished run that this one continues has reached it: more was asked for since."""
         reached = psnr is not None and self.validation_before is not None and self.validation_before >= psnr
         return None if reached else psnr
 
 
 def checkpoint_interval(budget: TrainingBudget, cost: float) -> float:
-    """Seconds until the next checkpoint, where nobody says; the last one took ``cost`` seconds."""
-    wanted = CHECKPOINT_SECONDS if budget.seconds is None else CHECKPOINT_SHARE * budget.seconds
-    return min(CHECKPOINT_SECONDS, max(wanted, cost / MAX_SAVING))
+    """Seconds until the next checkpoint by default; the last one took ``cost`` seconds."""
+    wanted = CHECKPOINT_SECONDS if budget.seconds is None else CHECKPOINT_FRACTION * budget.seconds
+    return min(CHECKPOINT_SECONDS, max(wanted, cost / MAX_SAVING_FRACTION))
 
 
-def lost_seconds(spent: Path, state: RunState) -> float:
-    """How much more training than ``state`` knows of a killed run has noted in the file ``spent``; 0 if it cannot be
-    read."""
+def lost_seconds(elapsed_file: Path, state: RunState) -> float:
+    """The seconds that a killed run trained after ``state``, by its ``elapsed_file``; 0 if that cannot be read."""
     try:
-        return max(0.0, float(spent.read_text()) - state.seconds)
+        return max(0.0, float(elapsed_file.read_text()) - state.seconds)
     except (OSError, ValueError):
         return 0.0
 
 
-class Pace:
-    """Running means of a run's speed and batch PSNR, forgetting after a few seconds. Shown, and used for planning.
+class TrainingSpeed:
+    """Moving averages of a run's speed and batch PSNR over a few seconds. Shown, and used for the schedule.
 
-    The first step of a process also wakes caches and libraries: it counts until there is a second one.
+    The first step of a process also fills caches and loads libraries: it counts only until there is a second one.
     """
 
     def __init__(self) -> None:
         self.count, self.seconds_per_step, self.rays_per_step, self.psnr = 0, 0.0, 0.0, 0.0
 
     def add(self, seconds: float, rays: int, psnr: float) -> None:
-        """Take one step into account."""
+        """Add one step."""
         self.count += 1
         if self.count > 2:
-            seconds = min(seconds, MAX_OF_A_STALL * self.seconds_per_step)
-        new = max(1 / max(1, self.count - 1), 1 - math.exp(-seconds / RATE_MEMORY_SECONDS))
+            seconds = min(seconds, MAX_STEP_SLOWDOWN * self.seconds_per_step)
+        new = max(1 / max(1, self.count - 1), 1 - math.exp(-seconds / SPEED_AVERAGING_SECONDS))
         self.seconds_per_step += new * (seconds - self.seconds_per_step)
         self.rays_per_step += new * (rays - self.rays_per_step)
         self.psnr += new * (psnr - self.psnr)
@@ -109,13 +108,13 @@ class TrainingLog:
         self.board = _board(folder / "tensorboard") if tensorboard else None
 
     def event(self, kind: str, step: int, **values: Any) -> None:
-        """Record that ``kind`` happened before ``step``."""
+        """Log that ``kind`` happened before ``step``."""
         with self.path.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps({"event": kind, "step": step, **values}) + "\n")
 
     def point(self, point: dict[str, Any]) -> None:
-        """Record one point of the curve."""
-        self.event("measured", **point)
+        """Log one point of the curve."""
+        self.event("evaluated", **point)
         if self.board is not None:
             for name in ("train_psnr", "probe_psnr", "probe_ssim"):
                 if point[name] is not None:

@@ -7,10 +7,10 @@ import torch
 
 from nerf.geometry.scene import Scene
 from nerf.runtime.matmul_precision import use_matmul_precision
+from nerf.training.evaluation_pixels import sample_evaluation_pixels
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.validation_probe import make_probe
 from stages.amounts import short_count
-from stages.contract import Inputs, Note, Progress, StageResult
+from stages.contract import Inputs, Progress, StageResult
 from stages.effects.decisions import read_decisions
 from stages.effects.image_effects import image_effects, learnt_effects
 from stages.hardware.device import compute_device, cores
@@ -20,55 +20,62 @@ from stages.io.files import read_scene
 from stages.train.checkpoints import checkpoint_files
 from stages.train.config import Config
 from stages.train.curve import (
-    coming_doubling,
-    doubling_words,
-    next_words,
+    doubling_message,
+    predicted_gain,
+    predicted_gain_message,
     sparkline,
-    target_words,
+    target_message,
     write_curve,
 )
 from stages.train.data import field_background, guided_dataset
-from stages.train.fields import field_of, make_trainer
+from stages.train.fields.field_list import field_of, make_trainer
 from stages.train.loop import TrainingRun
 from stages.train.more import budget_of, earlier_seconds
 from stages.train.precision import precision_facts, say_if_inexact
-from stages.train.profile import write_parts
-from stages.train.state import Probes, TrainingBudget, TrainingLog
-from stages.train.validation_images import PROBE_RAYS, PROBE_SEED, Target, unseen_photos, with_validation
+from stages.train.profile import write_profile
+from stages.train.state import EvaluationSets, TrainingBudget, TrainingLog
+from stages.train.validation_images import (
+    EVALUATION_PIXELS,
+    EVALUATION_SEED,
+    Target,
+    held_out_evaluation,
+    with_validation_split,
+)
 
 
 class Training(NamedTuple):
-    """A run that is ready for its first step, or its next one after a kill. ``earlier``: seconds of the trainings that
-    it goes on from; ``scene`` has the validation photos that a target asks for."""
+    """A run that is ready for its next step. ``earlier_seconds``: wall time of the trainings that it continues;
+    ``scene`` has the validation photos that a target needs."""
 
     config: Config
     scene: Scene
     run: TrainingRun
-    earlier: float
+    earlier_seconds: float
 
 
 def load(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Training:
     """Load the photos and put everything in place. Nothing is open in ``config``."""
     scene, earlier = read_scene(inputs["normalise"]), earlier_seconds(config, inputs)
     if config.target_psnr is not None:
-        scene = _with_photos_aside(config.target_psnr, scene, progress)
+        scene = _with_validation_photos(config.target_psnr, scene, progress)
     run = prepare(config, scene, inputs, folder, progress)
     say_if_inexact(config, progress)
     return Training(config, scene, run, earlier)
 
 
-def _with_photos_aside(target_psnr: float, scene: Scene, progress: Progress) -> Scene:
-    scene = with_validation(scene)
-    aside, left = len(scene.of_split("validation")), len(scene.of_split("train"))
+def _with_validation_photos(target_psnr: float, scene: Scene, progress: Progress) -> Scene:
+    scene = with_validation_split(scene)
+    validation, left = len(scene.of_split("validation")), len(scene.of_split("train"))
     progress.note(
         "train.validation-photos",
-        f"{aside} of {aside + left} training photos are set aside to tell when {target_psnr:g} dB are reached",
+        f"{validation} of {validation + left} training photos become validation photos, "
+        f"to tell when {target_psnr:g} dB are reached",
     )
     return scene
 
 
 def prepare(config: Config, scene: Scene, inputs: Inputs, folder: Path, progress: Progress) -> TrainingRun:
-    """Photos, probes, budget and trainer of a run. Raises StageError where the field takes too much memory."""
+    """Photos, evaluation pixels, budget and trainer of a run. Raises StageError if the field takes too much memory."""
     assert config.downscale is not None, "plan() chooses it"
     device = compute_device()
     if device == "cpu":
@@ -76,24 +83,24 @@ def prepare(config: Config, scene: Scene, inputs: Inputs, folder: Path, progress
         check_memory(field.memory_bytes(config, cores()), "the field", *field.memory_advice(config))
     progress.update("reading the photos")
     dataset = guided_dataset(inputs, scene, config.downscale, progress).to(device)
-    shown_over = torch.tensor(field_background(config, scene), device=device)
+    background = torch.tensor(field_background(config, scene), device=device)
 
-    probes = Probes(
-        make_probe(dataset, PROBE_RAYS, shown_over, PROBE_SEED),
-        unseen_photos(config, inputs["ingest"], scene, "test", device, progress),
+    evaluation_sets = EvaluationSets(
+        sample_evaluation_pixels(dataset, EVALUATION_PIXELS, background, EVALUATION_SEED),
+        held_out_evaluation(config, inputs["ingest"], scene, "test", device, progress),
     )
     if config.target_psnr is not None:
-        aside = unseen_photos(config, inputs["ingest"], scene, "validation", device, progress)
-        assert aside is not None, "load() sets some aside"
-        probes = probes._replace(target=Target(config.target_psnr, aside))
+        validation = held_out_evaluation(config, inputs["ingest"], scene, "validation", device, progress)
+        assert validation is not None, "load() makes some"
+        evaluation_sets = evaluation_sets._replace(target=Target(config.target_psnr, validation))
     budget = budget_of(config, inputs)
-    _say_sizes(config, budget, dataset, progress)
+    _note_sizes(config, budget, dataset, progress)
     decisions, views = read_decisions(inputs["effects"]), scene.of_split("train")
     return TrainingRun(
         lambda attempt: make_trainer(
             config, scene, dataset, config.seed + attempt, image_effects(decisions, views, dataset)
         ),
-        probes,
+        evaluation_sets,
         budget,
         folder,
         config.checkpoint_seconds,
@@ -102,15 +109,15 @@ def prepare(config: Config, scene: Scene, inputs: Inputs, folder: Path, progress
     )
 
 
-def _say_sizes(config: Config, budget: TrainingBudget, dataset: RayDataset, progress: Progress) -> None:
-    much = f"{budget.seconds:g} s" if budget.steps is None else f"{budget.steps:,} steps"
+def _note_sizes(config: Config, budget: TrainingBudget, dataset: RayDataset, progress: Progress) -> None:
+    amount = f"{budget.seconds:g} s" if budget.steps is None else f"{budget.steps:,} steps"
     another = "" if budget.after is None else "another "
     photos = f"{len(dataset.near)} photos at 1/{config.downscale:g} of their size"
     field = field_of(config)
     sizes = f"{config.field} field ({field.sizes_in_words(config)})"
-    progress.note("train.sizes", f"{sizes}, {another}{much} · {photos}, {short_count(len(dataset.pixels))} pixels")
-    if words := field.step_in_words(config):
-        progress.note("train.step", words)
+    progress.note("train.sizes", f"{sizes}, {another}{amount} · {photos}, {short_count(len(dataset.pixels))} pixels")
+    if message := field.step_in_words(config):
+        progress.note("train.step", message)
 
 
 def compute(training: Training) -> None:
@@ -127,25 +134,26 @@ def save(training: Training, folder: Path, progress: Progress) -> StageResult:
     info["background"] = list(field_background(config, scene))
     info["effects"] = learnt_effects(run.trainer.effects, scene.of_split("train"))
     save_field(folder, run.trainer.model, info)
-    write_curve(folder, config.kind, config.downscale, run.plan.is_whole, run.state.curve)
+    write_curve(folder, config.kind, config.downscale, run.schedule.is_single_cycle, run.state.curve)
     progress.update("measuring what this machine can do")
     with use_matmul_precision(config.matmul):
-        parts = write_parts(folder, run.state.timings, config, run.probes.train.colours.device)
-    for note in _closing_notes(training):
-        progress.note(*note)
-    left_behind = sorted(path.name for path in folder.glob("nonfinite_*.safetensors"))
-    board = ["tensorboard"] if config.tensorboard else []
+        profile = write_profile(folder, run.state.timings, config, run.evaluation_sets.train.colours.device)
+    for message in _closing_notes(training):
+        progress.note("train.outlook", message)
+    batches = sorted(path.name for path in folder.glob("nonfinite_*.safetensors"))
+    tensorboard = ["tensorboard"] if config.tensorboard else []
     final = checkpoint_files(run.checkpoints, run.state.step)
-    records = ("curve.json", "log.jsonl", "plan.json", *parts, *final, *left_behind, *board)
-    return StageResult(("field.safetensors", "field.json"), _line(training), records, _facts(training))
+    records = ("curve.json", "log.jsonl", "schedule.json", *profile, *final, *batches, *tensorboard)
+    return StageResult(("field.safetensors", "field.json"), _summary(training), records, _facts(training))
 
 
-def _closing_notes(training: Training) -> list[Note]:
-    """What the last doubling of the time bought, what the next is predicted to buy, and whether a target is reached."""
+def _closing_notes(training: Training) -> list[str]:
+    """The gain of the last doubling of the time, the predicted gain of the next, and whether a target is reached."""
     state, config = training.run.state, training.config
-    doubling = doubling_words(state.curve, coming_doubling(config.kind, training.run.plan.is_whole, state.curve))
-    target = target_words(state.open_target(config.target_psnr), state.validation_psnr, state.seconds)
-    return [Note(code, words) for code, words in (("train.doubling", doubling), ("train.target", target)) if words]
+    gain = predicted_gain(config.kind, training.run.schedule.is_single_cycle, state.curve)
+    doubling = doubling_message(state.curve, gain)
+    target = target_message(state.pending_target(config.target_psnr), state.validation_psnr, state.seconds)
+    return [message for message in (doubling, target) if message]
 
 
 def _facts(training: Training) -> dict[str, object]:
@@ -154,9 +162,9 @@ def _facts(training: Training) -> dict[str, object]:
         "field": config.field,
         "steps": state.step,
         "train_seconds": round(state.seconds, 3),
-        "earlier_seconds": round(training.earlier, 3),
+        "earlier_seconds": round(training.earlier_seconds, 3),
         "rays_per_second": round(state.rays / state.seconds, 1),
-        "samples_per_second": round(state.samples / state.seconds, 1),
+        "colours_per_second": round(state.colour_evaluations / state.seconds, 1),
         "train_psnr": last["train_psnr"],
         "probe_psnr": last["probe_psnr"],
         "validation_psnr": state.validation_psnr,
@@ -164,24 +172,25 @@ def _facts(training: Training) -> dict[str, object]:
         "downscale": config.downscale,
         "restarts": state.restarts,
         "rollbacks": state.rollbacks,
-        "symptom": state.symptom,
+        "failure_reason": state.failure_reason,
         **precision_facts(config),
     }
 
 
-def _line(training: Training) -> str:
+def _summary(training: Training) -> str:
     """180 s · 5.4 k steps · 24 k rays/s · 28.9 dB on test pixels, over time ▁▃▅▆▇█ · as long again (--more 3m) is
-    predicted to buy +0.6 ± 0.4 dB."""
+    predicted to gain +0.6 ± 0.4 dB."""
     config, state = training.config, training.run.state
     probe = state.curve[-1]["probe_psnr"]
-    before = "" if config.after is None else f", {state.seconds_before:.0f} s of them before"
+    before = "" if config.after is None else f", {state.seconds_before:.0f} s of them in the earlier training"
     parts: list[str | None] = [f"{state.seconds:.0f} s{before}"]
     parts += [f"{short_count(state.step)} steps", f"{short_count(state.rays / state.seconds)} rays/s"]
     spark = sparkline(state.curve)
     rising = f", over time {spark}" if spark else ""
     parts.append("no test photos" if probe is None else f"{probe:.1f} dB on test pixels{rising}")
-    parts.append(next_words(state.curve, coming_doubling(config.kind, training.run.plan.is_whole, state.curve)))
-    parts.append(target_words(state.open_target(config.target_psnr), state.validation_psnr, state.seconds))
-    if state.symptom is not None:
-        parts.append(f"of no use yet: {state.symptom}")
+    gain = predicted_gain(config.kind, training.run.schedule.is_single_cycle, state.curve)
+    parts.append(predicted_gain_message(state.curve, gain))
+    parts.append(target_message(state.pending_target(config.target_psnr), state.validation_psnr, state.seconds))
+    if state.failure_reason is not None:
+        parts.append(f"undertrained: {state.failure_reason}")
     return " · ".join(filter(None, parts))

@@ -1,4 +1,4 @@
-"""Photos that take no part in training, and what a field in training shows of them: a fixed handful of pixels."""
+"""Held-out photos (test and validation images), and how well a field in training shows some fixed pixels of them."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,8 +8,15 @@ import torch
 
 from nerf.effects import HeldOutImages
 from nerf.geometry.scene import Scene, Split
+from nerf.training.evaluation_pixels import (
+    EvaluationPatches,
+    EvaluationPixels,
+    evaluate,
+    render_patches,
+    sample_evaluation_patches,
+    sample_evaluation_pixels,
+)
 from nerf.training.trainer import FieldTrainer
-from nerf.training.validation_probe import Patches, Probe, make_patches, make_probe, measure, pictures
 from stages.contract import Progress, StageError
 from stages.effects.image_effects import held_out_images
 from stages.evaluate.image_metrics import ssim
@@ -17,43 +24,43 @@ from stages.io.photos import spread
 from stages.train.config import Config
 from stages.train.data import ALL_MASKED, field_background, training_dataset
 
-PROBE_RAYS = 2048
-PROBE_SEED = 0  # whatever the training's: curves of different seeds differ by what was trained, not by the pixels
-# SSIM looks at windows of 11 pixels. Many small squares tell more of the photos than a few large ones; together they
-# take twice the rays of the probe.
-PATCHES, PATCH_SIDE = 16, 16
-VALIDATION_EVERY = 8  # of the training photos one is set aside to decide by,
-MIN_LEFT = 4  # and with fewer left to train on none can be
-MAX_VALIDATION = 8  # where a target decides when to stop
+EVALUATION_PIXELS = 2048
+EVALUATION_SEED = 0  # whatever the training's: curves of different seeds differ by what was trained, not by the pixels
+# SSIM looks at windows of 11 pixels. Many small patches tell more of the photos than a few large ones; together they
+# take twice the rays of the pixels.
+EVALUATION_PATCHES, PATCH_SIZE = 16, 16
+VALIDATION_INTERVAL = 8  # one training photo in so many becomes a validation photo,
+MIN_TRAINING_PHOTOS = 4  # as long as so many are left to train on
+MAX_VALIDATION_PHOTOS = 8  # for a target PSNR
 
 
-class Unseen(NamedTuple):
-    """Pixels and patches of some photos, and these beside the training photos."""
+class HeldOutEvaluation(NamedTuple):
+    """Pixels and patches of held-out photos, and these photos beside the training photos."""
 
-    probe: Probe
-    patches: Patches
-    photos: HeldOutImages
+    pixels: EvaluationPixels
+    patches: EvaluationPatches
+    images: HeldOutImages
 
 
 class Target(NamedTuple):
-    """PSNR (dB) to be reached on photos that decide nothing else."""
+    """PSNR (dB) to be reached on validation photos."""
 
     psnr: float
-    photos: Unseen
+    held_out: HeldOutEvaluation
 
 
-class Look(NamedTuple):
-    """PSNR (dB) and SSIM; None where the photos are smaller than a window of SSIM, or masks leave no window."""
+class HeldOutQuality(NamedTuple):
+    """PSNR (dB) and SSIM; None if the photos are smaller than a window of SSIM, or masks leave no window."""
 
     psnr: float
     ssim: float | None
 
 
-def unseen_photos(
+def held_out_evaluation(
     config: Config, ingest: Path, scene: Scene, split: Split, device: str, progress: Progress
-) -> Unseen | None:
-    """Of the photos of a split, at the size at which photos are scored; None where it has none, or where masks leave
-    nothing of its test photos, which decide nothing: then ``progress`` is told. Always the same pixels."""
+) -> HeldOutEvaluation | None:
+    """Of the photos of a split, always the same pixels, at the size at which photos are scored. None if there are none,
+    or if masks leave nothing of the test photos, which decide nothing: then with a note."""
     if not scene.of_split(split):
         return None
     try:
@@ -63,49 +70,51 @@ def unseen_photos(
             raise
         progress.note("train.no-test-photos", f"test photos are not measured while training: {error.why}")
         return None
-    shown_over = torch.tensor(field_background(config, scene))
-    return Unseen(
-        make_probe(dataset, PROBE_RAYS, shown_over, PROBE_SEED).to(device),
-        make_patches(dataset, PATCHES, PATCH_SIDE, shown_over, PROBE_SEED).to(device),
+    background = torch.tensor(field_background(config, scene))
+    return HeldOutEvaluation(
+        sample_evaluation_pixels(dataset, EVALUATION_PIXELS, background, EVALUATION_SEED).to(device),
+        sample_evaluation_patches(dataset, EVALUATION_PATCHES, PATCH_SIZE, background, EVALUATION_SEED).to(device),
         held_out_images(scene.of_split("train"), scene.of_split(split), device),
     )
 
 
 def load_metrics() -> None:
-    """Import what :func:`look` computes with. It takes long: the first step should not wait for it, nor should the
-    first measurement be charged with it."""
+    """Import what :func:`evaluate_held_out` computes with. It takes long: neither the first step nor the first
+    evaluation should include it."""
     import kornia.metrics  # noqa: F401
 
 
-def look(trainer: FieldTrainer, unseen: Unseen) -> Look:
-    """How the field does on photos that it has never seen, exposed as their neighbours let expect."""
-    as_expected = trainer.effects.of_held_out(unseen.photos)
-    psnr = measure(trainer.model, unseen.probe, as_expected).psnr
-    rows = zip(*pictures(trainer.model, unseen.patches, as_expected), unseen.patches.used, strict=True)
+def evaluate_held_out(trainer: FieldTrainer, held_out: HeldOutEvaluation) -> HeldOutQuality:
+    """Quality on held-out photos, with the exposure expected from their neighbours."""
+    effects = trainer.effects.of_held_out(held_out.images)
+    psnr = evaluate(trainer.model, held_out.pixels, effects).psnr
+    rows = zip(*render_patches(trainer.model, held_out.patches, effects), held_out.patches.used, strict=True)
     known = [value for row in rows if (value := ssim(*(part.cpu() for part in row))) is not None]
-    return Look(psnr, sum(known) / len(known) if known else None)
+    return HeldOutQuality(psnr, sum(known) / len(known) if known else None)
 
 
-def with_validation(scene: Scene) -> Scene:
-    """``scene`` with every eighth training photo, at most MAX_VALIDATION, evenly spread, in the split "validation".
+def with_validation_split(scene: Scene) -> Scene:
+    """``scene`` with every eighth training photo, at most MAX_VALIDATION_PHOTOS, evenly spread, in the split
+    "validation".
 
-    Raises StageError where too few would be left to train on.
+    Raises StageError if too few would be left to train on.
     """
-    split = set_aside(scene, MAX_VALIDATION)
+    split = split_off_validation(scene, MAX_VALIDATION_PHOTOS)
     if split is None:
         count = len(scene.of_split("train"))
-        why = f"photos to decide by have to be set aside, and of {count} training photos too few would be left"
-        raise StageError("train.few-photos-for-target", "no target can be trained to", why, "Leave out --target-psnr.")
+        why = f"it needs validation photos, and {count} training photos are too few to spare any"
+        raise StageError(
+            "train.few-photos-for-target", "cannot train to a target PSNR", why, "Leave out --target-psnr."
+        )
     return split
 
 
-def set_aside(scene: Scene, most: int, least: int = 1) -> Scene | None:
+def split_off_validation(scene: Scene, most: int, least: int = 1) -> Scene | None:
     """``scene`` with every eighth training photo, ``least`` to ``most`` in all, evenly spread, in the split
-    "validation"; None where too few would be left to train on. Views keep their places, by which sparse points know
-    them."""
+    "validation"; None if too few would be left to train on. Views keep their order, which sparse points refer to."""
     train = scene.of_split("train")
-    count = max(least, min(most, len(train) // VALIDATION_EVERY))
-    if len(train) - count < MIN_LEFT:
+    count = max(least, min(most, len(train) // VALIDATION_INTERVAL))
+    if len(train) - count < MIN_TRAINING_PHOTOS:
         return None
     chosen = {train[i].name for i in spread(len(train), count)}
     views = (replace(view, split="validation") if view.name in chosen else view for view in scene.views)

@@ -21,8 +21,9 @@ from pipeline.engine import manifests
 
 MARK = "PIPELINE_DRILL"  # in the environment of a program and of all that it starts
 TINY = (
-    "--train.steps 60 --train.levels 2 --train.log2-rows 10 --train.finest 32 --train.batch-samples 1024"
-    " --train.chunks 2 --train.backend warp --train.checkpoint-seconds 0.05 --train.downscale 1 --evaluate.fraction 1"
+    "--train.steps 60 --train.grid.num-levels 2 --train.grid.log2-hashmap-size 10 --train.grid.max-res 32"
+    " --train.grid.target-samples 1024 --train.grid.micro-batches 2 --train.grid.backend warp"
+    " --train.checkpoint-seconds 0.05 --train.downscale 1 --evaluate.fraction 1"
     " --render.frames 6 --render.width 32 --mesh.resolution 24 --mesh.keep all"
 ).split()
 PATIENCE = 120.0  # seconds until a program counts as hanging

@@ -12,9 +12,9 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
+from nerf.training.evaluation_pixels import evaluate, sample_evaluation_pixels
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.validation_probe import make_probe, measure
 from nerf.training.vanilla_trainer import VanillaTrainer
 from stages import train
 from stages.contract import StageError, StageResult
@@ -24,23 +24,20 @@ from stages.io.field_files import load_field
 from stages.io.files import read_scene
 from stages.train import loop
 from stages.train.data import training_dataset
-from stages.train.fields import make_trainer, with_defaults
-from stages.train.health_check import symptom_of
+from stages.train.fields.field_list import make_trainer, with_defaults
+from stages.train.fields.hash_grid_options import HashGridOptions
+from stages.train.health_check import failure_reason
 from tests.refusals import refused
 from tests.stages.photo_scene import photographed
 
+GRID: dict[str, Any] = {"num_levels": 2, "log2_hashmap_size": 10, "max_res": 32, "target_samples": 1024}
 KINDS: dict[str, dict[str, Any]] = {
-    "torch": {"backend": "torch"},
-    "warp": {"backend": "warp"},
-    "paper": {"depth": 2, "width": 16, "samples_coarse": 8, "samples_fine": 8, "batch_rays": 64},
-}
-GRID: dict[str, Any] = {
-    "field": "grid",
-    "levels": 2,
-    "log2_rows": 10,
-    "finest": 32,
-    "batch_samples": 1024,
-    "learning_rate": 2e-2,
+    "torch": {"grid": GRID | {"backend": "torch"}, "learning_rate": 2e-2},
+    "warp": {"grid": GRID | {"backend": "warp"}, "learning_rate": 2e-2},
+    "vanilla": {
+        "vanilla": {"depth": 2, "width": 16, "samples_coarse": 8, "samples_fine": 8, "batch_rays": 64},
+        "learning_rate": 5e-3,
+    },
 }
 WARM_UP = 40
 NAMED = ("training diverged", "the field does not learn")
@@ -48,9 +45,9 @@ NAMED = ("training diverged", "the field does not learn")
 
 @pytest.fixture(autouse=True)
 def short_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop, "WARM_UP_STEPS", WARM_UP)
-    monkeypatch.setattr("stages.train.training.write_parts", lambda *_: [])
-    monkeypatch.setattr("stages.train.validation_images.PROBE_RAYS", 256)
+    monkeypatch.setattr(loop, "MIN_HEALTHY_STEPS", WARM_UP)
+    monkeypatch.setattr("stages.train.training.write_profile", lambda *_: [])
+    monkeypatch.setattr("stages.train.validation_images.EVALUATION_PIXELS", 256)
     monkeypatch.setattr(
         "nerf.fields.occupancy_grid.UPDATE_INTERVAL", 32
     )  # measuring it is most of what so small a field costs
@@ -63,16 +60,15 @@ def inputs(tmp_path: Path) -> dict[str, Path]:
 
 def trained(kind: str, inputs: dict[str, Path], folder: Path, progress: Any, **settings: Any) -> StageResult:
     folder.mkdir(exist_ok=True)
-    base: dict[str, Any] = {"learning_rate": 5e-3} if kind == "paper" else GRID
-    config: dict[str, Any] = {"downscale": 1.0} | base | KINDS[kind] | settings
+    config: dict[str, Any] = {"downscale": 1.0} | KINDS[kind] | settings
     return train.run(train.Config(**config), inputs, folder, progress)
 
 
 def seen(folder: Path, inputs: dict[str, Path], progress: Any) -> tuple[float, float]:
     """PSNR of the field in ``folder`` on training photos, and that of a flat colour."""
     dataset = training_dataset(inputs["ingest"], read_scene(inputs["normalise"]), "train", 1.0, progress)
-    probe = make_probe(dataset, 512, torch.ones(3), 0)
-    return measure(load_field(folder)[0], probe).psnr, probe.mean_colour_psnr
+    pixels = sample_evaluation_pixels(dataset, 512, torch.ones(3), 0)
+    return evaluate(load_field(folder)[0], pixels).psnr, pixels.mean_colour_psnr
 
 
 @pytest.mark.parametrize("steps", [WARM_UP - 20, WARM_UP + 20])
@@ -89,10 +85,10 @@ def test_a_far_too_high_rate_is_never_silent(
         return
     psnr, flat = seen(tmp_path / "train", inputs, progress)
     if psnr > flat + 1:  # the loop looks at other pixels
-        assert result.facts["symptom"] is None
+        assert result.facts["failure_reason"] is None
     if psnr < flat - 1:
-        assert steps < WARM_UP and str(result.facts["symptom"]) in result.line
-        assert any("the field is of no use yet" in note for note in progress.notes)
+        assert steps < WARM_UP and str(result.facts["failure_reason"]) in result.line
+        assert any("the field is undertrained" in note for note in progress.notes)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -101,8 +97,10 @@ def test_a_field_lost_after_warm_up_goes_back(
 ) -> None:
     spoil_once_at(WARM_UP + 20, _forget, monkeypatch, kind)
     result = trained(kind, inputs, tmp_path / "train", progress, steps=WARM_UP + 20, checkpoint_seconds=0.1)
-    assert (result.facts["rollbacks"], result.facts["symptom"]) == (1, None)
-    assert any("the field is lost: it is" in note and "at half the learning rate" in note for note in progress.notes)
+    assert (result.facts["rollbacks"], result.facts["failure_reason"]) == (1, None)
+    assert any(
+        "the field has collapsed: it is" in note and "at half the learning rate" in note for note in progress.notes
+    )
     psnr, flat = seen(tmp_path / "train", inputs, progress)
     assert flat + 1 < psnr < 60
 
@@ -124,7 +122,7 @@ def test_weights_that_the_last_update_broke_are_never_kept(
 ) -> None:
     def break_one_weight(trainer: Any) -> None:
         weights = trainer.state()
-        weights["model.table" if kind != "paper" else "model.fine.trunk.0.weight"].view(-1)[7] = poison
+        weights["model.table" if kind != "vanilla" else "model.fine.trunk.0.weight"].view(-1)[7] = poison
 
     spoil_once_at(12, break_one_weight, monkeypatch, kind)
     result = trained(kind, inputs, tmp_path / "train", progress, steps=12)
@@ -134,7 +132,12 @@ def test_weights_that_the_last_update_broke_are_never_kept(
 
 
 # Of the dataset: near and far, the cameras' places, their rotations; and how ray directions change from pixel to pixel.
-ROWS = {"near": ("geometry", 12), "far": ("geometry", 13), "centres": ("geometry", 9), "rotations": ("geometry", 4)}
+ROWS = {
+    "near": ("view_geometry", 12),
+    "far": ("view_geometry", 13),
+    "centres": ("view_geometry", 9),
+    "rotations": ("view_geometry", 4),
+}
 ROWS["ray_directions"] = ("patches", 1)
 
 
@@ -170,7 +173,7 @@ def test_per_image_parameters_are_gated_and_rolled_back(
     kind: str, effect: str, inputs: dict[str, Path], tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_decisions(inputs["effects"], read_decisions(inputs["effects"]).having(effect))
-    monkeypatch.setattr(loop, "WARM_UP_STEPS", 3 * WARM_UP)  # the rate is halved: at first it looks dead
+    monkeypatch.setattr(loop, "MIN_HEALTHY_STEPS", 3 * WARM_UP)  # the rate is halved: at first it looks collapsed
 
     def poison(trainer: Any) -> None:
         next(iter(trainer.effects.parameters.values())).detach().view(-1)[::2] = float("nan")
@@ -188,22 +191,22 @@ def weights_are_finite(folder: Path) -> bool:
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_checkpoint_of_a_sound_run_is_sound(kind: str, inputs: dict[str, Path], tmp_path: Path, progress: Any):
     result = trained(kind, inputs, tmp_path / "train", progress, steps=WARM_UP + 20, checkpoint_seconds=0.05)
-    assert (result.facts["rollbacks"], result.facts["restarts"], result.facts["symptom"]) == (0, 0, None)
-    assert not any("lost" in note or "no use" in note for note in progress.notes)
+    assert (result.facts["rollbacks"], result.facts["restarts"], result.facts["failure_reason"]) == (0, 0, None)
+    assert not any("collapsed" in note or "undertrained" in note for note in progress.notes)
 
 
-@pytest.mark.parametrize("other", [{"log2_rows": 11}, {"finest": 31}, {"levels": 3}])
+@pytest.mark.parametrize("other", [{"log2_hashmap_size": 11}, {"max_res": 31}, {"num_levels": 3}])
 def test_a_checkpoint_of_another_field_is_named_and_skipped(
     other: dict[str, int], inputs: dict[str, Path], tmp_path: Path, progress: Any
 ) -> None:
-    _checkpoint_of_another(tmp_path, inputs, progress, "torch", other)
+    _checkpoint_of_another(tmp_path, inputs, progress, "torch", {"grid": KINDS["torch"]["grid"] | other})
 
 
 @pytest.mark.parametrize("other", [{"width": 18}, {"depth": 3}, {"density_activation": "relu"}, {"spacing": "log"}])
-def test_so_is_one_of_another_paper_field(
+def test_so_is_one_of_another_vanilla_field(
     other: dict[str, Any], inputs: dict[str, Path], tmp_path: Path, progress: Any
 ) -> None:
-    _checkpoint_of_another(tmp_path, inputs, progress, "paper", other)
+    _checkpoint_of_another(tmp_path, inputs, progress, "vanilla", {"vanilla": KINDS["vanilla"]["vanilla"] | other})
 
 
 def _checkpoint_of_another(
@@ -218,26 +221,25 @@ def _checkpoint_of_another(
         shutil.copy(file, mine / "checkpoints")
     again = trained(kind, inputs, mine, progress, steps=10)
     assert again.facts["steps"] == 10
-    assert any("the checkpoint of step 20 is not of this training" in note for note in progress.notes)
+    assert any("the checkpoint of step 20 belongs to another training" in note for note in progress.notes)
     assert (mine / "field.safetensors").read_bytes() == expected
 
 
-def test_no_number_is_a_symptom(inputs: dict[str, Path], progress: Any) -> None:
+def test_nan_is_a_failure_reason(inputs: dict[str, Path], progress: Any) -> None:
     """Comparisons with NaN are false: neither empty nor worse than a flat colour would be said of it."""
     dataset = training_dataset(inputs["ingest"], read_scene(inputs["normalise"]), "train", 1.0, progress)
     trainer = train_loop_trainer(inputs, dataset)
-    probe = make_probe(dataset, 64, torch.ones(3), 0)
+    pixels = sample_evaluation_pixels(dataset, 64, torch.ones(3), 0)
     trainer.model.colour_out[:] = float("nan")
-    assert symptom_of(trainer, probe) == "its model.colour_out is not finite"
+    assert failure_reason(trainer, pixels) == "its model.colour_out is not finite"
     trainer.model.colour_out[:] = 3e38
     trainer.model.colour_hidden[:] = 3e38
-    symptom = symptom_of(trainer, probe)
-    assert symptom is None or "no number" in symptom or "flat colour" in symptom
+    reason = failure_reason(trainer, pixels)
+    assert reason is None or "not finite" in reason or "flat colour" in reason
 
 
 def train_loop_trainer(inputs: dict[str, Path], dataset: RayDataset) -> HashGridTrainer:
-    settings: dict[str, Any] = {"downscale": 1.0, "steps": 1, "chunks": 1} | GRID | KINDS["torch"]
-    asked = train.Config(**settings)
+    asked = train.Config(downscale=1.0, steps=1, grid=HashGridOptions(**GRID, micro_batches=1, backend="torch"))
     config = with_defaults(asked.model_copy(update={"contracted": False, "view_dependence": True}))
     trainer = make_trainer(config, read_scene(inputs["normalise"]), dataset, 0)
     assert isinstance(trainer, HashGridTrainer)
@@ -277,7 +279,7 @@ def _forget(trainer: Any) -> None:
 
 def spoil_at(step: int, spoil: Callable[[Any], None], monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     """``spoil`` the trainer whenever it has taken so many steps."""
-    trainer = VanillaTrainer if kind == "paper" else HashGridTrainer
+    trainer = VanillaTrainer if kind == "vanilla" else HashGridTrainer
     take = trainer.step
 
     def spoiled(self: Any, number: int, *rest: float):

@@ -26,7 +26,11 @@ class LimitedTo:
 @pytest.mark.parametrize(
     "stage, options, hint",
     [
-        ("train", "--train.log2-rows 24 --train.levels 16 --train.finest 4096", "--train.log2-rows"),
+        (
+            "train",
+            "--train.grid.log2-hashmap-size 24 --train.grid.num-levels 16 --train.grid.max-res 4096",
+            "--train.grid.log2-hashmap-size",
+        ),
         ("render", "--render.width 8192", "--render.width 4096"),
         ("mesh", "--mesh.resolution 1024", "--mesh.resolution "),
     ],

@@ -33,12 +33,16 @@ def test_any_number_of_threads(chain: Chain, tmp_path: Path, count: int):
     assert results(tmp_path / "w.nerf") == chain.expected
 
 
+TINY_GRID = (
+    "--train.grid.num-levels 2 --train.grid.log2-hashmap-size 10 --train.grid.max-res 32"
+    " --train.grid.target-samples 1024 --train.grid.micro-batches 2"
+)
 FIELDS = {
-    "torch": "--train.backend torch --train.steps 20",
-    "paper": "--train.field paper --train.width 32 --train.depth 2 --train.skip 1 --train.samples-coarse 8"
-    " --train.samples-fine 8 --train.batch-rays 512 --train.steps 20",
+    "torch": "--train.grid.backend torch --train.steps 20",
+    "vanilla": "--train.vanilla.width 32 --train.vanilla.depth 2 --train.vanilla.skip 1"
+    " --train.vanilla.samples-coarse 8 --train.vanilla.samples-fine 8 --train.vanilla.batch-rays 512 --train.steps 20",
     "effects": "--effect background=on --effect exposure=on --effect pose_refinement=on --train.steps 20"
-    " --train.backend warp",
+    " --train.grid.backend warp",
 }
 
 
@@ -48,8 +52,7 @@ def test_every_field_and_backend(chain: Chain, tmp_path: Path, kind: str):
     found = []
     for count in (1, 2, 4):
         workspace = chain.before("effects", tmp_path / f"{count}.nerf")
-        tiny = "--train.levels 2 --train.log2-rows 10 --train.finest 32 --train.batch-samples 1024 --train.chunks 2"
-        sizes = "" if kind == "paper" else tiny
+        sizes = "" if kind == "vanilla" else TINY_GRID
         words = f"run {chain.photos} -o {workspace} --until evaluate {sizes} {FIELDS[kind]}"
         words += " --train.downscale 1 --evaluate.fraction 1"
         Program(words.split(), tmp_path / "says", Threads(count)).finish()

@@ -20,7 +20,8 @@ from tests.small_scenes import OPENGL_FROM_OPENCV, pinhole_directions
 
 SIZE, FOCAL_PX = 40, 52.0
 SMALL = (
-    "--train.steps 300 --train.levels 3 --train.log2-rows 12 --train.finest 64 --train.batch-samples 4096"
+    "--train.steps 300 --train.grid.num-levels 3 --train.grid.log2-hashmap-size 12 --train.grid.max-res 64"
+    " --train.grid.target-samples 4096"
     " --train.downscale 1 --render.frames 2 --render.width 32 --mesh.resolution 32 --mesh.formats ply glb"
 ).split()
 

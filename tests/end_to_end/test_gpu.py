@@ -53,11 +53,12 @@ def test_the_chain_on_a_gpu_agrees_with_the_cpu(tmp_path: Path) -> None:
 
 
 def test_both_backends_train_lego(shared_data: Path, tmp_path: Path) -> None:
-    flags = "--train.steps 200 --train.downscale 2 --train.batch-samples 65536".split()
+    flags = "--train.steps 200 --train.downscale 2 --train.grid.target-samples 65536".split()
     if not (photos := shared_data / "lego_400").is_dir():
         pytest.skip(f"no photos at {photos}")
     by_torch, by_warp = (
-        probe_psnr(photos, tmp_path / f"{name}.nerf", *flags, "--train.backend", name) for name in ("torch", "warp")
+        probe_psnr(photos, tmp_path / f"{name}.nerf", *flags, "--train.grid.backend", name)
+        for name in ("torch", "warp")
     )
     assert min(by_torch, by_warp) > 22
     assert abs(by_torch - by_warp) < 0.5

@@ -14,14 +14,14 @@ ELSEWHERE = {
     "tests/nerf/kernels/warp/test_warp.py; "
     "NaN stays NaN: tests/numerics/test_not_a_number.py",
     "nerf/kernels/torch/occupancy.py": "comparisons and bits, exact: "
-    "tests/nerf/kernels/torch/test_occupancy.py; a cell that is "
-    "no number counts as occupied",
+    "tests/nerf/kernels/torch/test_occupancy.py; a NaN cell "
+    "counts as occupied",
     "nerf/kernels/torch/early_termination.py": "sums of optical depth in float64, the step size as marching "
     "takes it: tests/nerf/kernels/test_early_termination.py",
     "nerf/kernels/torch/colour_sampling.py": "1 − exp(−x) as in compositing, of optical depth summed in float64; "
-    "differences of it are off by 1e-7, and what is no number is left out and reaches the light behind it: "
+    "differences of it are off by 1e-7, and NaN is left out and spoils the transmittance behind it: "
     "tests/nerf/kernels/test_colour_sampling.py",
-    "nerf/rendering/early_termination.py": "cuts rays where the light is below 1e-3: "
+    "nerf/rendering/early_termination.py": "ends rays at a transmittance below 1e-3: "
     "tests/nerf/fields/test_hash_grid.py",
     "nerf/fields/hash_grid.py": "puts rows together: tests/nerf/fields/test_hash_grid.py",
     "nerf/fields/occupancy_grid.py": "σ times the step size; the outermost cells, which reach to infinity, count "
@@ -32,27 +32,28 @@ ELSEWHERE = {
     "divided by it: tests/nerf/training/test_ray_dataset.py",
     "nerf/rendering/srgb.py": "the standard's own curve, its inverse, from nothing to 1e30: "
     "tests/nerf/rendering/test_srgb.py",
-    "nerf/effects/exposure.py": "powers taken between powers, without light in between; value, gradient, extremes: "
+    "nerf/effects/exposure.py": "from one power law to the other, without linear light in between; value, "
+    "gradient, extremes: "
     "tests/nerf/effects/test_exposure.py",
     "nerf/effects/__init__.py": "effects in order, by the chain rule: tests/nerf/effects/test_composition.py; "
     "gains of a photo's rays, from nothing to 1e30: tests/nerf/effects/test_exposure_model.py",
     "nerf/effects/appearance.py": "changes no bit where effects change nothing: tests/nerf/effects/test_exposure.py",
     "nerf/geometry/rotations.py": "its series below 0.1 radians, against the matrix exponential from 0 to beyond π: "
     "tests/nerf/geometry/test_rotations.py",
-    "nerf/effects/pose_refinement.py": "turns and shifts of rays, up to 3.1 radians: "
+    "nerf/effects/pose_refinement.py": "rotations and translations of rays, up to 3.1 radians: "
     "tests/nerf/effects/test_pose_refinement.py; the fit of one is a search: tests/nerf/effects/test_pose_fit.py",
     "nerf/geometry/pose_distance.py": "float64, ratios of distances: tests/nerf/geometry/test_pose_distance.py",
-    "nerf/rendering/images.py": "cuts pictures into chunks: tests/nerf/rendering/test_images.py",
-    "nerf/training/validation_probe.py": "mean colour, PSNR, patches of pixels: "
-    "tests/nerf/training/test_validation_probe.py",
+    "nerf/rendering/images.py": "cuts images into chunks: tests/nerf/rendering/test_images.py",
+    "nerf/training/evaluation_pixels.py": "mean colour, PSNR, patches of pixels: "
+    "tests/nerf/training/test_evaluation_pixels.py",
     "nerf/training/trainer.py": "a pixel over its background, linear in alpha: "
     "tests/nerf/training/test_vanilla_trainer.py",
-    "nerf/training/vanilla_trainer.py": "sums of chunks; refuses what is not finite before the update: "
+    "nerf/training/vanilla_trainer.py": "sums of micro-batches; refuses non-finite values before the update: "
     "tests/nerf/training/test_vanilla_trainer.py",
     "nerf/training/hash_grid_trainer.py": "likewise: tests/nerf/training/test_hash_grid_trainer.py",
-    "nerf/runtime/matmul_precision.py": "lets products be off by 1e-4 beside float64, where that is faster: "
+    "nerf/runtime/matmul_precision.py": "lets matrix products be off by 1e-4 if that is faster: "
     "tests/nerf/runtime/test_matmul_precision.py",
-    "nerf/training/schedule.py": "rates within the range they are given, in float64: "
+    "nerf/training/schedule.py": "learning rates within the range they are given, in float64: "
     "tests/nerf/training/test_schedule.py",
     "nerf/training/learning_curve.py": "interpolation in log time, in float64: "
     "tests/nerf/training/test_learning_curve.py",

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from nerf import REGION_HALF
+from nerf import REGION_HALF_SIZE
 from nerf.effects.statistics.statistic import Evidence, unknown
 
 NEVER = float("inf")  # the threshold of what no share decides, and its noise: only alpha does
@@ -23,7 +23,7 @@ def background_evidence(
     seen = np.bincount(point, minlength=len(position)).astype(float)
     if not seen.any():
         return unknown("share", NEVER, "no tracks", True)
-    beyond = np.abs(position).max(axis=1) > REGION_HALF
+    beyond = np.abs(position).max(axis=1) > REGION_HALF_SIZE
     share = float(np.average(beyond, weights=seen))
     words = (
         f"only alpha could tell that nothing lies beyond the region: {share:.1%} of what is tracked does, and "

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from nerf.rendering.srgb import KNEE, OFFSET, POWER, linear_light
+from nerf.rendering.srgb import LINEAR_THRESHOLD, OFFSET, POWER, linear_light
 
 MAX_IN_TRACK = 64  # observations of one point that enter a fit: their number of pairs is what a fit costs
 
@@ -79,4 +79,4 @@ def log_noise(colour: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     differences that a window a little beside the point makes.
     """
     value = np.maximum(colour, 0.5 / 255)
-    return np.where(value <= KNEE, 1 / value, POWER / (value + OFFSET))
+    return np.where(value <= LINEAR_THRESHOLD, 1 / value, POWER / (value + OFFSET))

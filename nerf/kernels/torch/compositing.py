@@ -25,7 +25,11 @@ MIN_KEEP_PROBABILITY = 1 / 16  # of a thin sample to be kept, so that no interva
 
 
 def visible_samples(
-    samples: Samples, sigma: Float[Tensor, "samples"], threshold: float, thin: float, offset: Float[Tensor, "rays"]
+    samples: Samples,
+    sigma: Float[Tensor, "samples"],
+    threshold: float,
+    thinning_threshold: float,
+    thinning_offset: Float[Tensor, "rays"],
 ) -> tuple[Samples, Int32[Tensor, "kept"]]:
     """The samples that are worth a colour, and their numbers among all.
 
@@ -33,15 +37,16 @@ def visible_samples(
     everything. ``sigma`` must be the density that will be composited: older ones (the cache's) would hide a surface
     from the very gradient that is to move it.
 
-    Of those thinner than ``thin`` each is kept with probability p = max(tau / thin, MIN_KEEP_PROBABILITY), and its
-    interval is made 1 / p times as long: it stands for others like it, so that sums of tau f over a ray keep their
-    expectation, and so do gradients of densities. Probabilities are added up along the ray, beginning with ``offset``,
-    a random number in [0, 1), and a sample is kept where the sum reaches a whole number (systematic sampling;
-    Carpenter et al. 1999), so that thin fog is sampled evenly. ``thin`` 0 keeps all.
+    Of those thinner than ``thinning_threshold`` each is kept with probability p = max(tau / thin,
+    MIN_KEEP_PROBABILITY), and its interval is made 1 / p times as long: it stands for others like it, so that sums of
+    tau f over a ray keep their expectation, and so do gradients of densities. Probabilities are added up along the ray,
+    beginning with ``thinning_offset``, a random number in [0, 1), and a sample is kept where the sum reaches a whole
+    number (systematic sampling; Carpenter et al. 1999), so that thin fog is sampled evenly. ``thinning_threshold`` 0
+    keeps all.
     """
-    probability = _keep_probability(sigma * samples.dt, thin)
+    probability = _keep_probability(sigma * samples.dt, thinning_threshold)
     of_thin = torch.where(probability < 1, probability, 0).double()
-    before = sums_before(samples, of_thin) + offset.double().index_select(0, samples.ray)
+    before = sums_before(samples, of_thin) + thinning_offset.double().index_select(0, samples.ray)
     kept = ~(probability < 1) | ((before + of_thin).floor() > before.floor())
     index = (kept & (_transmittances(samples, sigma).before >= threshold)).nonzero()[:, 0]
     starts = torch.searchsorted(index, samples.starts.long(), out_int32=True)
@@ -50,9 +55,9 @@ def visible_samples(
     return Samples(starts, ray, t, dt), index
 
 
-def _keep_probability(tau: Float[Tensor, "samples"], thin: float) -> Float[Tensor, "samples"]:
+def _keep_probability(tau: Float[Tensor, "samples"], thinning_threshold: float) -> Float[Tensor, "samples"]:
     """Of a sample to be kept; 1 for what is no number, that it may be noticed."""
-    return torch.where(tau < thin, (tau / thin).clamp(min=MIN_KEEP_PROBABILITY), 1)
+    return torch.where(tau < thinning_threshold, (tau / thinning_threshold).clamp(min=MIN_KEEP_PROBABILITY), 1)
 
 
 def composite(

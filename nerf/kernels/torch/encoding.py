@@ -74,7 +74,7 @@ def _cell(
 
 def _corner_rows(layout: GridLayout, level: int, cell: Int32[Tensor, "3 points"]) -> Int32[Tensor, "8 points"]:
     """Table rows of the corners of each cell, z changing fastest."""
-    if layout.hashed(level):
+    if layout.is_hashed(level):
         x, y, z = (torch.stack([prime * c, prime * (c + 1)]) for prime, c in zip(PRIMES, cell, strict=True))
         number = x[:, None, None] ^ y[:, None] ^ z
         number = number & (layout.level_rows(level) - 1)
@@ -82,7 +82,7 @@ def _corner_rows(layout: GridLayout, level: int, cell: Int32[Tensor, "3 points"]
         side = layout.resolutions[level] + 1
         x, y, z = (torch.stack([c, c + 1]) for c in cell)
         number = (side * x[:, None] + y)[:, :, None] * side + z
-    return (layout.first_rows[level] + number).flatten(0, 2)
+    return (layout.level_offsets[level] + number).flatten(0, 2)
 
 
 def _corner_shares(inside: Float[Tensor, "3 points"]) -> Float[Tensor, "8 points"]:

@@ -9,15 +9,17 @@ from torch import Tensor
 from nerf.kernels import Samples
 
 
-def add_ray_relu(samples: Samples, hidden: Float[Tensor, "samples width"], of_ray: Float[Tensor, "rays width"]) -> None:
+def add_ray_relu(
+    samples: Samples, hidden: Float[Tensor, "samples width"], ray_hidden: Float[Tensor, "rays width"]
+) -> None:
     """In place: every sample's row of ``hidden`` plus that of its ray, negative sums becoming zero."""
-    hidden.add_(of_ray.index_select(0, samples.ray)).relu_()
+    hidden.add_(ray_hidden.index_select(0, samples.ray)).relu_()
 
 
 def add_ray_relu_backward(
     samples: Samples, hidden: Float[Tensor, "samples width"], grad: Float[Tensor, "samples width"]
 ) -> Float[Tensor, "rays width"]:
-    """The gradient of ``of_ray``; in place, ``grad`` becomes that of the sum. ``hidden`` is what came out."""
+    """The gradient of ``ray_hidden``; in place, ``grad`` becomes that of the sum. ``hidden`` is what came out."""
     relu_backward(hidden, grad)
     ray = samples.ray.long()  # by 32-bit numbers torch adds rows several times slower
     return grad.new_zeros(len(samples.starts) - 1, grad.shape[1]).index_add_(0, ray, grad)

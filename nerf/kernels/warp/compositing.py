@@ -22,18 +22,24 @@ _SERIES_BELOW = wp.constant(0.2)  # the first term that artanh's series leaves o
 
 
 def visible_samples(
-    samples: Samples, sigma: Float[Tensor, "samples"], threshold: float, thin: float, offset: Float[Tensor, "rays"]
+    samples: Samples,
+    sigma: Float[Tensor, "samples"],
+    threshold: float,
+    thinning_threshold: float,
+    thinning_offset: Float[Tensor, "rays"],
 ) -> tuple[Samples, Int32[Tensor, "kept"]]:
     """As in nerf.kernels.torch.compositing."""
     rays, device = len(samples.starts) - 1, sigma.device
     counts = torch.empty(rays, dtype=torch.int32, device=device)
-    launch(_count_visible, rays, samples.starts, samples.dt, sigma, threshold, thin, offset, counts)
+    launch(
+        _count_visible, rays, samples.starts, samples.dt, sigma, threshold, thinning_threshold, thinning_offset, counts
+    )
     starts = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int32), (1, 0))
     total = int(starts[-1])
     index, ray = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
     t, dt = (torch.empty(total, device=device) for _ in range(2))
     packed = samples.t, samples.dt, sigma
-    launch(_keep_visible, rays, samples.starts, starts, *packed, thin, offset, index, ray, t, dt)
+    launch(_keep_visible, rays, samples.starts, starts, *packed, thinning_threshold, thinning_offset, index, ray, t, dt)
     return Samples(starts, ray, t, dt), index
 
 
@@ -107,10 +113,10 @@ def opacity_of(tau: float):
 
 
 @wp.func
-def _keep_probability(tau: float, thin: float):
+def _keep_probability(tau: float, thinning_threshold: float):
     """Of a sample to be kept; 1 for what is no number."""
-    if tau < thin:
-        return wp.max(tau / thin, _MIN_KEEP_PROBABILITY)
+    if tau < thinning_threshold:
+        return wp.max(tau / thinning_threshold, _MIN_KEEP_PROBABILITY)
     return 1.0
 
 
@@ -120,7 +126,7 @@ def _count_visible(
     lengths: wp.array[float],
     sigma: wp.array[float],
     threshold: float,
-    thin: float,
+    thinning_threshold: float,
     offsets: wp.array[float],
     counts: wp.array[int],
 ):
@@ -133,7 +139,7 @@ def _count_visible(
     while i < end and wp.exp(-float(tau)) >= threshold:
         more = optical_thickness(sigma[i], lengths[i])
         tau += wp.float64(more)
-        probability = _keep_probability(more, thin)
+        probability = _keep_probability(more, thinning_threshold)
         if probability < 1.0:
             before = wp.floor(probabilities)
             probabilities += wp.float64(probability)
@@ -151,7 +157,7 @@ def _keep_visible(
     distances: wp.array[float],
     lengths: wp.array[float],
     sigma: wp.array[float],
-    thin: float,
+    thinning_threshold: float,
     offsets: wp.array[float],
     index: wp.array[int],
     rays: wp.array[int],
@@ -164,7 +170,7 @@ def _keep_visible(
     end = kept_starts[ray + 1]
     i = int(starts[ray])
     while place < end:
-        probability = _keep_probability(optical_thickness(sigma[i], lengths[i]), thin)
+        probability = _keep_probability(optical_thickness(sigma[i], lengths[i]), thinning_threshold)
         kept = bool(True)
         if probability < 1.0:
             before = wp.floor(probabilities)

@@ -64,7 +64,7 @@ def _levels(layout: GridLayout, device: torch.device) -> Tensor:
     if layout.features != FEATURES:
         raise ValueError(f"these kernels are for {FEATURES} features per vertex, not {layout.features}")
     rows = [
-        (resolution, layout.first_rows[level], layout.level_rows(level) - 1, int(layout.hashed(level)))
+        (resolution, layout.level_offsets[level], layout.level_rows(level) - 1, int(layout.is_hashed(level)))
         for level, resolution in enumerate(layout.resolutions)
     ]
     return torch.tensor(rows, dtype=torch.int32, device=device)

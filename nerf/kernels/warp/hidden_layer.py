@@ -16,18 +16,18 @@ _HIDDEN = 64
 _TOGETHER = wp.constant(64)
 
 
-def add_ray_relu(samples: Samples, hidden: Float[Tensor, "samples 64"], of_ray: Float[Tensor, "rays 64"]) -> None:
+def add_ray_relu(samples: Samples, hidden: Float[Tensor, "samples 64"], ray_hidden: Float[Tensor, "rays 64"]) -> None:
     """As in nerf.kernels.torch.hidden_layer."""
-    launch(_add_ray_relu, len(of_ray), samples.starts, of_ray, hidden)
+    launch(_add_ray_relu, len(ray_hidden), samples.starts, ray_hidden, hidden)
 
 
 def add_ray_relu_backward(
     samples: Samples, hidden: Float[Tensor, "samples 64"], grad: Float[Tensor, "samples 64"]
 ) -> Float[Tensor, "rays 64"]:
     """As in nerf.kernels.torch.hidden_layer."""
-    of_ray = grad.new_empty(len(samples.starts) - 1, _HIDDEN)
-    launch(_add_ray_relu_backward, len(of_ray), samples.starts, hidden, grad, of_ray)
-    return of_ray
+    ray_hidden = grad.new_empty(len(samples.starts) - 1, _HIDDEN)
+    launch(_add_ray_relu_backward, len(ray_hidden), samples.starts, hidden, grad, ray_hidden)
+    return ray_hidden
 
 
 def relu_backward(hidden: Float[Tensor, "samples 64"], grad: Float[Tensor, "samples 64"]) -> None:
@@ -49,12 +49,12 @@ def _where_positive(hidden: vec16, grad: vec16):
 
 
 @wp.kernel
-def _add_ray_relu(starts: wp.array[int], of_ray: wp.array[vec16], hidden: wp.array[vec16]):
+def _add_ray_relu(starts: wp.array[int], ray_hidden: wp.array[vec16], hidden: wp.array[vec16]):
     ray = wp.tid()
-    a = of_ray[4 * ray]
-    b = of_ray[4 * ray + 1]
-    c = of_ray[4 * ray + 2]
-    d = of_ray[4 * ray + 3]
+    a = ray_hidden[4 * ray]
+    b = ray_hidden[4 * ray + 1]
+    c = ray_hidden[4 * ray + 2]
+    d = ray_hidden[4 * ray + 3]
     for i in range(starts[ray], starts[ray + 1]):
         hidden[4 * i] = _rectified(hidden[4 * i] + a)
         hidden[4 * i + 1] = _rectified(hidden[4 * i + 1] + b)
@@ -64,14 +64,14 @@ def _add_ray_relu(starts: wp.array[int], of_ray: wp.array[vec16], hidden: wp.arr
 
 @wp.kernel
 def _add_ray_relu_backward(
-    starts: wp.array[int], hidden: wp.array[vec16], grad: wp.array[vec16], of_ray: wp.array[vec16]
+    starts: wp.array[int], hidden: wp.array[vec16], grad: wp.array[vec16], ray_hidden: wp.array[vec16]
 ):
     ray = wp.tid()
     end = starts[ray + 1]
-    of_ray[4 * ray] = vec16(0.0)
-    of_ray[4 * ray + 1] = vec16(0.0)
-    of_ray[4 * ray + 2] = vec16(0.0)
-    of_ray[4 * ray + 3] = vec16(0.0)
+    ray_hidden[4 * ray] = vec16(0.0)
+    ray_hidden[4 * ray + 1] = vec16(0.0)
+    ray_hidden[4 * ray + 2] = vec16(0.0)
+    ray_hidden[4 * ray + 3] = vec16(0.0)
     for first in range(starts[ray], end, _TOGETHER):
         a = vec16(0.0)
         b = vec16(0.0)
@@ -86,10 +86,10 @@ def _add_ray_relu_backward(
             b += grad[4 * i + 1]
             c += grad[4 * i + 2]
             d += grad[4 * i + 3]
-        of_ray[4 * ray] = of_ray[4 * ray] + a
-        of_ray[4 * ray + 1] = of_ray[4 * ray + 1] + b
-        of_ray[4 * ray + 2] = of_ray[4 * ray + 2] + c
-        of_ray[4 * ray + 3] = of_ray[4 * ray + 3] + d
+        ray_hidden[4 * ray] = ray_hidden[4 * ray] + a
+        ray_hidden[4 * ray + 1] = ray_hidden[4 * ray + 1] + b
+        ray_hidden[4 * ray + 2] = ray_hidden[4 * ray + 2] + c
+        ray_hidden[4 * ray + 3] = ray_hidden[4 * ray + 3] + d
 
 
 @wp.kernel

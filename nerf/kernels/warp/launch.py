@@ -36,7 +36,7 @@ vec16 = wp.types.vector(length=16, dtype=wp.float32)  # a cache line: rows of 64
 PACKAGE = "nerf.kernels.warp"
 
 
-def why_not(device: str) -> str | None:
+def unavailable_reason(device: str) -> str | None:
     """What keeps Warp's kernels from running on ``device`` ("cpu" or "cuda"); None if nothing does."""
     if device == "cpu" or wp.is_cuda_available():
         return None

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nerf.fields import background, mlp
-from nerf.fields.mlp import DIRECTION, GEOMETRY, MAX_LOG_DENSITY, DensityPass, Weights
+from nerf.fields.mlp import DIRECTION_FEATURES, GEOMETRY_FEATURES, MAX_LOG_DENSITY, DensityPass, Weights
 from nerf.fields.vanilla import SOFTPLUS_SHIFT, shifted_softplus
 from nerf.kernels import Backend, GridLayout, Samples, grid_layout
 from nerf.kernels.torch.adam import BETA1, BETA2, EPSILON
@@ -24,7 +24,7 @@ def _table(like: Tensor) -> Tensor:
 
 
 def _weights(like: Tensor) -> Weights:
-    drawn = mlp.initial_weights(FEATURES, DIRECTION, torch.Generator().manual_seed(8))
+    drawn = mlp.initial_weights(FEATURES, DIRECTION_FEATURES, torch.Generator().manual_seed(8))
     return Weights(*(part.to(like) for part in drawn))
 
 
@@ -70,12 +70,12 @@ def _trilinear(table: Tensor, points: Tensor, layout: GridLayout = LAYOUT) -> Te
 
 def _row(layout: GridLayout, level: int, vertex: Tensor) -> Tensor:
     x, y, z = vertex.unbind(-1)
-    if layout.hashed(level):
+    if layout.is_hashed(level):
         number = (x ^ (y * 2654435761) ^ (z * 805459861)) % layout.level_rows(level)
     else:
         side = layout.resolutions[level] + 1
         number = (x * side + y) * side + z
-    return layout.first_rows[level] + number
+    return layout.level_offsets[level] + number
 
 
 def _table_points(like: Tensor) -> Tensor:
@@ -124,16 +124,16 @@ def _sigma(_: Backend, logarithm: Tensor) -> Tensor:
 
 def _sigma_backward(backend: Backend, grad: Tensor, logarithm: Tensor) -> tuple[Tensor]:
     """Alone: of a network whose hidden layer is silent, and whose colours ask for nothing."""
-    geometry = torch.nn.functional.pad(logarithm, (0, GEOMETRY - 1))
-    features, sigma = torch.zeros(len(logarithm), FEATURES).to(logarithm), mlp.sigma_of(geometry)
-    done = DensityPass(features, geometry, sigma)
-    of_geometry = torch.zeros_like(geometry)
-    mlp.density_backward(_weights(logarithm), backend, done, grad[:, 0], of_geometry)
-    return (of_geometry[:, :1],)
+    geometry_features = torch.nn.functional.pad(logarithm, (0, GEOMETRY_FEATURES - 1))
+    features, sigma = torch.zeros(len(logarithm), FEATURES).to(logarithm), mlp.sigma_of(geometry_features)
+    done = DensityPass(features, geometry_features, sigma)
+    grad_geometry_features = torch.zeros_like(geometry_features)
+    mlp.density_backward(_weights(logarithm), backend, done, grad[:, 0], grad_geometry_features)
+    return (grad_geometry_features[:, :1],)
 
 
 def _density(_: Backend, features: Tensor) -> Tensor:
-    return mlp.density_forward(_weights(features), features).geometry
+    return mlp.density_forward(_weights(features), features).geometry_features
 
 
 def _density_backward(backend: Backend, grad: Tensor, features: Tensor) -> tuple[Tensor]:
@@ -154,22 +154,24 @@ def _each(like: Tensor) -> Samples:
     return Samples(each, each[:-1], like[:, 0].contiguous(), like[:, 0].contiguous())
 
 
-def _colour(backend: Backend, geometry: Tensor, harmonics: Tensor) -> Tensor:
-    weights = _weights(geometry)
-    of_rays = mlp.ray_hidden(weights, harmonics)
-    return mlp.colour_forward(weights, backend, _each(geometry), geometry, of_rays).colour
+def _colour(backend: Backend, geometry_features: Tensor, harmonics: Tensor) -> Tensor:
+    weights = _weights(geometry_features)
+    ray_hidden = mlp.direction_hidden(weights, harmonics)
+    return mlp.colour_forward(weights, backend, _each(geometry_features), geometry_features, ray_hidden).colour
 
 
-def _colour_backward(backend: Backend, grad: Tensor, geometry: Tensor, harmonics: Tensor) -> tuple[Tensor, Tensor]:
-    weights, samples = _weights(geometry), _each(geometry)
-    done = mlp.colour_forward(weights, backend, samples, geometry, mlp.ray_hidden(weights, harmonics))
+def _colour_backward(
+    backend: Backend, grad: Tensor, geometry_features: Tensor, harmonics: Tensor
+) -> tuple[Tensor, Tensor]:
+    weights, samples = _weights(geometry_features), _each(geometry_features)
+    done = mlp.colour_forward(weights, backend, samples, geometry_features, mlp.direction_hidden(weights, harmonics))
     gradients = mlp.colour_backward(weights, backend, samples, done, harmonics, grad)
-    return gradients.geometry, gradients.harmonics
+    return gradients.geometry_features, gradients.harmonics
 
 
-def _colour_plainly(geometry: Tensor, harmonics: Tensor) -> Tensor:
-    weights = _weights(geometry)
-    hidden = torch.relu(torch.cat([geometry, harmonics], -1) @ weights.colour_hidden)
+def _colour_plainly(geometry_features: Tensor, harmonics: Tensor) -> Tensor:
+    weights = _weights(geometry_features)
+    hidden = torch.relu(torch.cat([geometry_features, harmonics], -1) @ weights.colour_hidden)
     return torch.sigmoid(hidden @ weights.colour_out.T)
 
 
@@ -274,7 +276,7 @@ CASES = [
         kernels=True,
     ),
     Case(
-        formula="the sky: sigmoid of what its table has on the unit sphere",
+        formula="background model: sigmoid of its table's features on the unit sphere",
         where="nerf/fields/background.py: background_colour, background_backward",
         domain="finite features",
         hazard="levels cancel: a logit is off by half an ulp of the largest feature; 1 − c is 0 beyond 17",
@@ -312,7 +314,7 @@ CASES = [
         where="nerf/fields/mlp.py: sigma_of, density_backward",
         domain="all finite x",
         hazard="exp overflows beyond 88, and its gradient with it",
-        answer="x is limited to 15, where 0.001 units already stop all light but e⁻³⁰⁰⁰; beyond the gradient is 0",
+        answer="x is limited to 15, where 0.001 units already transmit no more than e⁻³⁰⁰⁰; beyond the gradient is 0",
         tried="|x| < 15; −1e30, −200, −88, ±0, around 15, 88, 1e30",
         typical=lambda: (uniform(1, -15, 15, 512, 1),),
         extreme=lambda: (LOGARITHMS,),
@@ -325,7 +327,7 @@ CASES = [
         kernels=True,
     ),
     Case(
-        formula="density log(1 + exp(x + shift)) of the paper's field",
+        formula="density log(1 + exp(x + shift)) of the vanilla NeRF",
         where="nerf/fields/vanilla.py: shifted_softplus",
         domain="all finite x",
         hazard="exp overflows beyond 88; 1 + exp(x) loses x < −16",
@@ -340,11 +342,11 @@ CASES = [
         differentiable=1,
     ),
     Case(
-        formula="density network: rectified products",
+        formula="density network: matrix products and ReLU",
         where="nerf/fields/mlp.py: density_forward, density_backward",
         domain="features up to 1e30",
         hazard="sums of 64 products cancel; relu has two slopes at 0",
-        answer="float32 products whatever else; errors are shares of the largest output",
+        answer="always float32 products; errors are shares of the largest output",
         tried="features of size 1, 1e-4, 1e-38, 0, 1e30",
         typical=lambda: (uniform(1, -1, 1, 256, FEATURES),),
         extreme=lambda: (uniform(2, -1, 1, 5, FEATURES) * torch.tensor([[1e-4], [1e-38], [0], [1e30], [1e10]]),),
@@ -359,14 +361,14 @@ CASES = [
     Case(
         formula="colour network, sigmoid, c (1 − c)",
         where="nerf/fields/mlp.py: colour_forward, colour_backward",
-        domain="geometry up to 1e30",
+        domain="geometry features up to 1e30",
         hazard="1 − c is 0 in float32 for logits beyond 17: a saturated colour has no gradient",
         answer="accepted: the true one is below 6e-8; finite for every logit",
-        tried="geometry of size 1, 0, 1e-38, 1e3, 1e30; harmonics of size 1",
-        typical=lambda: (uniform(1, -1, 1, 256, GEOMETRY), uniform(2, -1, 1, 256, DIRECTION)),
+        tried="geometry features of size 1, 0, 1e-38, 1e3, 1e30; harmonics of size 1",
+        typical=lambda: (uniform(1, -1, 1, 256, GEOMETRY_FEATURES), uniform(2, -1, 1, 256, DIRECTION_FEATURES)),
         extreme=lambda: (
-            uniform(3, -1, 1, 4, GEOMETRY) * torch.tensor([[0], [1e-38], [1e3], [1e30]]),
-            uniform(4, -1, 1, 4, DIRECTION),
+            uniform(3, -1, 1, 4, GEOMETRY_FEATURES) * torch.tensor([[0], [1e-38], [1e3], [1e30]]),
+            uniform(4, -1, 1, 4, DIRECTION_FEATURES),
         ),
         function=_colour,
         reference=_colour_plainly,
@@ -377,7 +379,7 @@ CASES = [
         kernels=True,
     ),
     Case(
-        formula="Adam without motion where the gradient is 0",
+        formula="Adam that skips entries with zero gradient",
         where="nerf/kernels/torch/adam.py: adam",
         domain="|g| < 1.8e19: beyond, g² overflows, and the norm of all gradients with it: the step is refused",
         hazard="g² underflows below 1e-19; m / √v is 0/0 for an entry never touched",

@@ -219,7 +219,7 @@ CASES = [
         where="nerf/geometry/rays.py: points_on",
         domain="finite",
         hazard="cancels where o and t d are long and their sum is short: a camera 1e6 units off sees 0.06 units coarse",
-        answer="the scene frame has its region in ±0.9, wherever sfm had it; paper fields take rays in float64",
+        answer="the scene frame has its region in ±0.9, wherever sfm had it; the vanilla NeRF takes rays in float64",
         tried="|o| < 3, t < 30; t from 0 and 1e-45 to 1e30",
         typical=_spread_rays,
         extreme=_far_rays,
@@ -243,7 +243,7 @@ CASES = [
         **_unit_points(False),
     ),
     Case(
-        formula="unit coordinates of samples, all of space",
+        formula="unit coordinates of samples, contracted",
         where="nerf/kernels/torch/marching.py: sample_points, sample_points_backward",
         domain="all finite points",
         hazard="r³ overflows beyond 1e12 in the gradient −2 (r − 1)/r³",

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pycolmap
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
-from stages.sfm.geometry_check import PairMatches
+from stages.sfm.geometry_check import MIN_PAIR_MATCHES, PairMatches
 
 MAX_MATCHES_CHECKED = 200  # of a pair, drawn by the seed: their median is known to a tenth of their spread
 
@@ -45,7 +45,8 @@ def read_pair_matches(
     ids = sorted(model.reg_image_ids())
     number = {image_id: place for place, image_id in enumerate(ids)}
     random = np.random.default_rng(seed)
-    pairs, weights, keypoints = [], [], []
+    xy = {image_id: _keypoints(db, image_id) for image_id in ids}
+    pairs, weights, keypoints, noise = [], [], [], []
     for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
         first, second = pycolmap.pair_id_to_image_pair(pair_id)
         inliers = np.asarray(geometry.inlier_matches, int).reshape(-1, 2)
@@ -56,7 +57,9 @@ def read_pair_matches(
         if most and len(inliers) > most:
             inliers = inliers[random.choice(len(inliers), most, replace=False)]
         keypoints.append(inliers)
-    directions = [_directions(db, model, image_id) for image_id in ids]
+        if geometry.F is not None and len(inliers) >= MIN_PAIR_MATCHES:
+            noise.append(_epipolar_px(geometry.F, xy[first][inliers[:, 0]], xy[second][inliers[:, 1]]))
+    directions = [_directions(xy[image_id], model.camera(model.image(image_id).camera_id)) for image_id in ids]
     begins = np.concatenate([[0], np.cumsum([len(some) for some in directions])]).astype(int)
     rows = [some + begins[list(pair)] for some, pair in zip(keypoints, pairs, strict=True)]
     return ids, PairMatches(
@@ -67,11 +70,26 @@ def read_pair_matches(
         photo=np.repeat(np.arange(len(ids)), np.diff(begins)),
         ray_direction=np.concatenate([np.zeros((0, 3)), *directions]),
         focal_px=np.array([model.camera(model.image(i).camera_id).mean_focal_length() for i in ids]),
+        noise_px=float(np.median(noise)) if noise else np.nan,
     )
 
 
-def _directions(db: pycolmap.Database, model: pycolmap.Reconstruction, image_id: int) -> np.ndarray:
+def _keypoints(db: pycolmap.Database, image_id: int) -> Float[np.ndarray, "keypoints 2"]:
+    return np.array(db.read_keypoints(image_id), float).reshape(-1, 6)[:, :2]
+
+
+def _directions(xy: Float[np.ndarray, "keypoints 2"], camera: pycolmap.Camera) -> Float[np.ndarray, "keypoints 3"]:
     """Unit rays of a photo's keypoints in its camera's frame; along the axis where the camera model has none."""
-    xy = np.array(db.read_keypoints(image_id), float).reshape(-1, 6)[:, :2]
-    rays = np.asarray(model.camera(model.image(image_id).camera_id).cam_ray_from_img(xy), float).reshape(-1, 3)
+    rays = np.asarray(camera.cam_ray_from_img(xy), float).reshape(-1, 3)
     return np.where(np.isfinite(rays).all(axis=1, keepdims=True), rays, [0.0, 0.0, 1.0])
+
+
+def _epipolar_px(
+    fundamental: Float[np.ndarray, "3 3"], first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"]
+) -> float:
+    """The median distance of matches from an epipolar geometry (Sampson; Hartley and Zisserman 2004, section 11.4)."""
+    x, y = (np.concatenate([xy, np.ones((len(xy), 1))], axis=1) for xy in (first, second))
+    there, here = x @ fundamental.T, y @ fundamental
+    slope = np.hypot(np.linalg.norm(there[:, :2], axis=1), np.linalg.norm(here[:, :2], axis=1))
+    distance = np.abs(np.einsum("ij,ij->i", y, there))
+    return float(np.median(np.divide(distance, slope, out=np.zeros_like(slope), where=slope > 0)))

@@ -17,6 +17,7 @@ from stages.sfm.retry_strategies import MIN_POSE_INLIERS
 NEARLY_ALL = 0.9
 # A single image may merely have a bad pose in one of two models: it takes several to say that the models contradict.
 MIN_DIFFERENT, MIN_DIFFERENT_FRACTION = 2, 0.2
+MAX_DIFFERENT_FRACTION = 0.05  # of the images that two models share, whose poses may differ
 
 
 class Links(NamedTuple):
@@ -101,6 +102,12 @@ def compare_models(model: pycolmap.Reconstruction, other: pycolmap.Reconstructio
         turned = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
         facts |= {"centre": float(off.mean() / extent), "degrees": float(turned.mean())}
     return facts
+
+
+def disagree(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> bool:
+    """Whether two models of the same images give more than a few of them different poses."""
+    compared = compare_models(model, other)
+    return len(compared["different"]) > MAX_DIFFERENT_FRACTION * compared["photos"]
 
 
 def _poses(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:

@@ -21,6 +21,7 @@ from stages.sfm.geometry_check import (
     PoseCheck,
     check_poses,
     consistent_matches,
+    fits_as_a_whole,
     is_fragmented,
     outside_main_segment,
     sequence_breaks,
@@ -36,9 +37,20 @@ class Checked(NamedTuple):
     matches: PairMatches
     check: PoseCheck
 
+    @property
+    def fits(self) -> bool:
+        """Whether the poses as a whole fit the matches as exactly as these allow."""
+        return fits_as_a_whole(self.matches, self.check)
+
     def failed(self) -> list[int]:
         """The image ids of photos whose poses fail the check."""
         return [image_id for image_id, passed in zip(self.ids, self.check.passed, strict=True) if not passed]
+
+
+CLEARLY_FEWER = 0.9  # of the pairs that agree with another model
+
+Candidate = tuple[pycolmap.Reconstruction, Checked]
+"""A model and its check."""
 
 
 def check_model(model: pycolmap.Reconstruction, database: Path, seed: int) -> Checked:
@@ -48,11 +60,32 @@ def check_model(model: pycolmap.Reconstruction, database: Path, seed: int) -> Ch
     return Checked(ids, matches, check_poses(matches, camera_poses(model)))
 
 
-def agreeing_pairs(model: pycolmap.Reconstruction, database: Path, seed: int, files: Container[str]) -> int:
-    """How many verified pairs with one of these images agree with the model's poses."""
-    ids, matches, check = check_model(model, database, seed)
-    among = np.array([model.image(image_id).name in files for image_id in ids], bool)
-    return int((check.agrees & among[matches.pairs].any(axis=1)).sum())
+def better(first: Candidate, second: Candidate) -> Candidate:
+    """The model that clearly more verified pairs agree with, else the one of which more photos pass, else the first."""
+    strict = [_under_smallest_tolerance(one, (first, second)) for one in (first, second)]
+    pairs, photos = ([int(getattr(check, name).sum()) for check in strict] for name in ("agrees", "passed"))
+    if min(pairs) >= CLEARLY_FEWER * max(pairs):
+        return second if photos[1] > photos[0] else first
+    return second if pairs[1] > pairs[0] else first
+
+
+def agreeing_pairs(first: Candidate, second: Candidate, files: Container[str]) -> tuple[int, int]:
+    """How many verified pairs with one of these images agree with the poses of either model."""
+
+    def count(candidate: Candidate) -> int:
+        (model, (ids, matches, _)), check = candidate, _under_smallest_tolerance(candidate, (first, second))
+        among = np.array([model.image(image_id).name in files for image_id in ids], bool)
+        return int((check.agrees & among[matches.pairs].any(axis=1)).sum())
+
+    return count(first), count(second)
+
+
+def _under_smallest_tolerance(candidate: Candidate, candidates: Sequence[Candidate]) -> PoseCheck:
+    """The check with one tolerance for all: a model that is wrong as a whole has large errors everywhere, and so a
+    large tolerance of its own."""
+    model, checked = candidate
+    tolerance = min(one.check.tolerance_px for _, one in candidates)
+    return check_poses(checked.matches, camera_poses(model), tolerance)
 
 
 def camera_poses(model: pycolmap.Reconstruction) -> Float[np.ndarray, "photos 3 4"]:
@@ -134,6 +167,8 @@ def facts(model: pycolmap.Reconstruction, checked: Checked, sequence: Sequence[i
         "agreeing": int(check.agrees.sum()),
         "error_px": check.median_px,
         "tolerance_px": check.tolerance_px,
+        "noise_px": None if np.isnan(checked.matches.noise_px) else checked.matches.noise_px,
+        "fits": checked.fits,
         "doubtful": [name for name, misplaced in zip(names, check.misplaced, strict=True) if misplaced],
         "weak_links": [
             {"photos": [names[i] for i in link.photos], "pairs": link.pairs, "matches": link.matches}

@@ -1,7 +1,7 @@
 """The hash-grid field as stage train has it: what it is trained with by default, how large it is, what a step costs."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from nerf.effects import ImageEffects
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
@@ -13,8 +13,9 @@ from stages.contract import Progress
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.hardware.device import compute_device, cores
 from stages.hardware.memory import available_on
-from stages.train.config import MAX_MICRO_BATCHES, Config
+from stages.train.config import Config
 from stages.train.data import has_background_model, space_of, training_background
+from stages.train.fields.hash_grid_options import MAX_MICRO_BATCHES
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
@@ -22,9 +23,9 @@ if TYPE_CHECKING:
 
 # At first; both fall while training. In contracted space a cell is met from farther away, and rays are longer.
 LEARNING_RATES = {"bounded": 2e-2, "contracted": 1e-2}
-# Colours that each part of a step computes, so each core: half of what a part takes does not depend on how many they
-# are, and fewer cost as long. In a box more of them go with its closer samples (docs/experiments/colour_samples.md).
-PART_SAMPLES = {"bounded": 3 << 13, "contracted": 1 << 14}
+# Colours that each micro-batch computes, so each core: half of what one takes does not depend on how many they are, and
+# fewer cost as long. In a box more of them go with its closer samples (docs/experiments/colour_samples.md).
+MICRO_BATCH_SAMPLES = {"bounded": 3 << 13, "contracted": 1 << 14}
 # The largest step, which a GPU takes as fast as a small one. Its gradients are sure enough for the larger rate
 # (docs/experiments/colour_samples.md).
 MAX_STEP_SAMPLES, LARGE_STEP_LEARNING_RATE = 1 << 18, 2e-2
@@ -46,8 +47,8 @@ MAX_STEPS = 576  # bounded scenes: steps along the diagonal of the box
 # cells gain more by more rays than by closer samples (docs/experiments/cell_sizes.md).
 STEPS_PER_CELL = {512: 3, 2048: 1.5}
 EVEN_UNTIL = 0.25  # contracted space: scene units from the camera up to which steps are even; beyond, they grow
-# Contracted space: at the shortest steps so many samples reach to a distance of 23; --train.ray-samples may ask for
-# more.
+# Contracted space: at the shortest steps so many samples reach to a distance of 23; --train.grid.ray-samples may ask
+# for more.
 MAX_SAMPLES = 1024
 SAMPLES_PER_RAY = {"bounded": 3, "contracted": 10}
 """Colours computed for a ray, over a run: measured on lego_400 and five photo sets (docs/results.md)."""
@@ -55,7 +56,7 @@ SIZES = {
     "bounded": ((50e6, 5, 18, 512), (0, 4, 17, 256)),
     "contracted": ((30e6, 6, 18, 1024), (0, 5, 17, 512)),
 }
-"""(computed colours from which on it pays, levels, log2 of rows, most cells along an axis), the largest first."""
+"""(computed colours from which on it pays, num_levels, log2_hashmap_size, most max_res), the largest first."""
 # The same on a GPU, which reads a large table as fast as a small one.
 GPU_SIZES = {"bounded": (200e6, 8, 20, 1024), "contracted": (200e6, 8, 20, 2048)}
 MIN_MAX_RES = 128
@@ -66,23 +67,24 @@ SAMPLE_BYTES = 4096  # that a sample of a step takes while it is computed
 
 def with_defaults(config: Config) -> Config:
     """``config`` with what this field is usually trained with where it leaves that open."""
-    gpu, parts = compute_device() == "cuda", config.chunks or min(MAX_MICRO_BATCHES, cores())
-    most = MAX_STEP_SAMPLES if gpu else min(MAX_STEP_SAMPLES, parts * PART_SAMPLES[config.space])
-    samples = config.batch_samples or most
+    gpu, micro_batches = compute_device() == "cuda", config.grid.micro_batches or min(MAX_MICRO_BATCHES, cores())
+    most = MAX_STEP_SAMPLES if gpu else min(MAX_STEP_SAMPLES, micro_batches * MICRO_BATCH_SAMPLES[config.space])
+    samples = config.grid.target_samples or most
     rate = LARGE_STEP_LEARNING_RATE if samples >= MAX_STEP_SAMPLES else LEARNING_RATES[config.space]
-    return config.filled({"background": "random", "learning_rate": rate, "batch_samples": samples, "chunks": parts})
+    grid = {"target_samples": samples, "micro_batches": micro_batches}
+    return config.filled({"background": "random", "learning_rate": rate, "grid": grid})
 
 
 def prepared(config: Config, progress: Progress) -> Config:
     """``config`` with kernels that run here, compiled."""
-    backend = config.backend or chosen_backend(compute_device(), progress)
+    backend = config.grid.backend or chosen_backend(compute_device(), progress)
     load_backend(backend, compute_device(), progress)
-    return config.model_copy(update={"backend": backend})
+    return config.filled({"grid": {"backend": backend}})
 
 
 def is_sized(config: Config) -> bool:
     """Whether ``config`` leaves no size of the field open."""
-    return None not in (config.levels, config.log2_rows, config.finest)
+    return None not in (config.grid.num_levels, config.grid.log2_hashmap_size, config.grid.max_res)
 
 
 def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress | None = None) -> Config:
@@ -99,14 +101,14 @@ def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress |
     pixels = max(max(camera.width, camera.height) for camera in cameras) / config.downscale
     across = 2 ** math.ceil(math.log2(pixels * (CONTRACTED_BOX / BOX if config.contracted else 1)))
     wanted, *smaller = (
-        {"levels": levels, "log2_rows": log2_rows, "finest": max(MIN_MAX_RES, min(most, across))}
-        for least, levels, log2_rows, most in sizes
+        _size(levels, log2_size, max(MIN_MAX_RES, min(most, across)))
+        for least, levels, log2_size, most in sizes
         if samples >= least
     )
     free = available_on(device)
 
-    def bytes_of(size: dict[str, Any]) -> float:
-        return memory_bytes(config.filled(size), cores())
+    def bytes_of(size: dict[str, int]) -> float:
+        return memory_bytes(config.filled({"grid": size}), cores())
 
     fitting = (size for size in (wanted, *smaller) if bytes_of(size) <= MAX_MEMORY_SHARE * free)
     chosen = next(fitting, [wanted, *smaller][-1])
@@ -116,23 +118,27 @@ def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress |
             f"{_grids(chosen)}: {_grids(wanted)}, which the budget could fill, take {bytes_in_words(bytes_of(wanted))} "
             f"while they are trained, and {bytes_in_words(free)} of memory are free",
         )
-    return config.filled(chosen)
+    return config.filled({"grid": chosen})
 
 
-def _grids(size: dict[str, Any]) -> str:
-    return f"{size['levels']} grids of up to 2^{size['log2_rows']} rows"
+def _size(num_levels: int, log2_hashmap_size: int, max_res: int) -> dict[str, int]:
+    return {"num_levels": num_levels, "log2_hashmap_size": log2_hashmap_size, "max_res": max_res}
+
+
+def _grids(size: dict[str, int]) -> str:
+    return f"{size['num_levels']} grids of up to 2^{size['log2_hashmap_size']} rows"
 
 
 def timed(config: Config, device: str) -> Config:
     """``config`` under which speed is measured before sizes are known: those which most budgets get."""
-    _, levels, log2_rows, finest = SIZES[config.space][0]
-    return config.filled({"levels": levels, "log2_rows": log2_rows, "finest": finest})
+    _, *size = SIZES[config.space][0]
+    return config.filled({"grid": _size(*size)})
 
 
 def rays_per_step(config: Config) -> float:
     """Rays of one step, expected from the colours that it computes."""
-    assert config.batch_samples is not None, "plan() chooses it"
-    return config.batch_samples / SAMPLES_PER_RAY[config.space]
+    assert config.grid.target_samples is not None, "plan() chooses it"
+    return config.grid.target_samples / SAMPLES_PER_RAY[config.space]
 
 
 def work(config: Config, rays: float) -> str:
@@ -143,13 +149,15 @@ def work(config: Config, rays: float) -> str:
 def memory_bytes(config: Config, workers: int) -> float:
     """Memory on the CPU that training takes beside the photos, so many chunks of work at a time."""
     settings = field_settings(config, sky=False)  # which is small beside the rest
-    assert config.batch_samples, "plan() chooses it"
-    return TABLE_COPIES * 4 * settings.features_per_level * settings.layout.rows + SAMPLE_BYTES * config.batch_samples
+    assert config.grid.target_samples, "plan() chooses it"
+    table = TABLE_COPIES * 4 * settings.features_per_level * settings.layout.rows
+    return table + SAMPLE_BYTES * config.grid.target_samples
 
 
 def memory_advice(config: Config) -> tuple[str, str]:
     """What takes that memory, and how it would take less."""
-    return f"{config.levels} grids of up to 2^{config.log2_rows} rows take", "Give a smaller --train.log2-rows."
+    why = f"{config.grid.num_levels} grids of up to 2^{config.grid.log2_hashmap_size} rows take"
+    return why, "Give a smaller --train.grid.log2-hashmap-size."
 
 
 def matmul_width(config: Config) -> int:
@@ -164,16 +172,18 @@ def table_rows(config: Config) -> int:
 
 def sizes_in_words(config: Config) -> str:
     """``5 grids of up to 2^18 rows, to 512³``."""
-    return f"{config.levels} grids of up to 2^{config.log2_rows} rows, to {config.finest}³"
+    grid = config.grid
+    return f"{grid.num_levels} grids of up to 2^{grid.log2_hashmap_size} rows, to {grid.max_res}³"
 
 
 def step_in_words(config: Config) -> str:
     """How a step is divided and what computes it, and where samples stand along a ray."""
+    grid = config.grid
     stepping = field_settings(config, sky=False).stepping
     cone = f", from {stepping.linear_until:g} on every {stepping.cone_angle:.1%} of the distance"
     growing = cone if stepping.cone_angle else ""
-    parts = f"{config.chunks} part{'' if config.chunks == 1 else 's'}"
-    step = f"{config.batch_samples:,} colours a step in {parts}, by {config.backend}"
+    parts = f"{grid.micro_batches} micro-batch{'' if grid.micro_batches == 1 else 'es'}"
+    step = f"{grid.target_samples:,} colours a step in {parts}, by {grid.backend}"
     return f"{step} · samples every {stepping.step_size:.2g} scene units{growing}"
 
 
@@ -181,8 +191,8 @@ def make_trainer(
     config: Config, scene: "Scene", dataset: "RayDataset", seed: int, effects: ImageEffects
 ) -> HashGridTrainer:
     """A fresh field with its trainer, where ``dataset`` is."""
-    assert config.backend, "plan() chooses it"
-    backend = load_backend(config.backend, dataset.device.type)
+    assert config.grid.backend, "plan() chooses it"
+    backend = load_backend(config.grid.backend, dataset.device.type)
     model = HashGridField(field_settings(config, has_background_model(config, scene)), seed, backend).to(dataset.device)
     return HashGridTrainer(model, dataset, _trainer_settings(config, scene, seed), effects)
 
@@ -191,19 +201,20 @@ def field_settings(config: Config, sky: bool) -> HashGridSettings:
     """Sizes of the field. Samples stand as close as the finest cells can tell them apart: in contracted space a third
     to two thirds of a cell near the camera, growing with the distance, as pixels do; in a box a cell, or MAX_STEPS in
     all."""
-    assert config.levels and config.log2_rows and config.finest, "plan() chooses them"
+    grid = config.grid
+    assert grid.num_levels and grid.log2_hashmap_size and grid.max_res, "plan() chooses them"
     assert config.contracted is not None and config.view_dependence is not None, "plan() takes them from stage effects"
-    shortest = 2 * CONTRACTED_BOX / (_steps_across(config.finest) * config.ray_samples)
+    shortest = 2 * CONTRACTED_BOX / (_steps_across(grid.max_res) * grid.ray_samples)
     return HashGridSettings(
-        num_levels=config.levels,
-        log2_hashmap_size=config.log2_rows,
-        base_res=min(BASE_RES[config.space], config.finest),
-        max_res=config.finest,
+        num_levels=grid.num_levels,
+        log2_hashmap_size=grid.log2_hashmap_size,
+        base_res=min(BASE_RES[config.space], grid.max_res),
+        max_res=grid.max_res,
         space=space_of(config),
-        diagonal_steps=max(1, round(config.ray_samples * min(math.sqrt(3) * config.finest, MAX_STEPS))),
+        diagonal_steps=max(1, round(grid.ray_samples * min(math.sqrt(3) * grid.max_res, MAX_STEPS))),
         min_step_size=shortest,
         cone_angle=shortest / EVEN_UNTIL,
-        max_samples_per_ray=math.ceil(MAX_SAMPLES * max(1.0, config.ray_samples)),
+        max_samples_per_ray=math.ceil(MAX_SAMPLES * max(1.0, grid.ray_samples)),
         view_dependence=config.view_dependence,
         background_model=sky,
     )
@@ -215,14 +226,15 @@ def _steps_across(max_res: int) -> float:
 
 
 def _trainer_settings(config: Config, scene: "Scene", seed: int) -> HashGridTrainerSettings:
-    assert config.batch_samples and config.chunks and config.learning_rate, "plan() chooses them"
+    grid = config.grid
+    assert grid.target_samples and grid.micro_batches and config.learning_rate, "plan() chooses them"
     return HashGridTrainerSettings(
         seed=seed,
         background=training_background(config, scene),
-        samples=config.batch_samples,
-        chunks=config.chunks,
-        rate=config.learning_rate,
-        distortion=DISTORTION if config.contracted else 0.0,
-        depth_loss=DEPTH_LOSS,
-        least_photos=MIN_PHOTOS,
+        target_samples=grid.target_samples,
+        micro_batches=grid.micro_batches,
+        learning_rate=config.learning_rate,
+        distortion_weight=DISTORTION if config.contracted else 0.0,
+        depth_weight=DEPTH_LOSS,
+        min_photos=MIN_PHOTOS,
     )

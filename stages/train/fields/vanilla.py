@@ -1,7 +1,6 @@
 """The vanilla NeRF as stage train has it: what it is trained with by default, how large it is, what a step costs."""
 
-from dataclasses import fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from nerf.effects import ImageEffects
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
@@ -15,27 +14,15 @@ if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
     from nerf.training.ray_dataset import RayDataset
 
-# The small networks have few steps and take large ones: after 300 of 512 rays on lego_400 at a quarter of its size a
+# The reduced networks have few steps and take large ones: after 300 of 512 rays on lego_400 at a quarter of its size a
 # start at 5e-4 gave 14.7 dB held out, 2e-3 17.4, 5e-3 19.1. The published ones are those of the released lego config.
-SIZES = {
-    "small": {
-        "depth": 4,
-        "width": 64,
-        "skip": 4,
-        "samples_coarse": 32,
-        "samples_fine": 32,
-        "batch_rays": 512,
-        "learning_rate": 5e-3,
-    },
-    "published": {
-        "depth": 8,
-        "width": 256,
-        "skip": 4,
-        "samples_coarse": 64,
-        "samples_fine": 128,
-        "batch_rays": 1024,
-        "learning_rate": 5e-4,
-    },
+REDUCED: dict[str, Any] = {
+    "learning_rate": 5e-3,
+    "vanilla": {"depth": 4, "width": 64, "skip": 4, "samples_coarse": 32, "samples_fine": 32, "batch_rays": 512},
+}
+PUBLISHED: dict[str, Any] = {
+    "learning_rate": 5e-4,
+    "vanilla": {"depth": 8, "width": 256, "skip": 4, "samples_coarse": 64, "samples_fine": 128, "batch_rays": 1024},
 }
 FINAL_LEARNING_RATE = 0.1  # of that at the start
 MAX_TIMED_RAYS = {"cpu": 256, "cuda": 1 << 20}
@@ -46,9 +33,9 @@ ACTIVATIONS_PER_LAYER = 2  # numbers kept of each unit for its gradient
 
 def with_defaults(config: Config) -> Config:
     """``config`` with what this field is usually trained with where it leaves that open."""
-    sizes = SIZES["published" if config.preset == "paper" else "small"]
-    spacing = "log" if config.contracted else "linear"
-    return config.filled({"background": "white", "spacing": spacing, **sizes})
+    spacing = {"vanilla": {"spacing": "log" if config.contracted else "linear"}}
+    sizes = PUBLISHED if config.preset == "paper" else REDUCED
+    return config.filled({"background": "white"}).filled(spacing).filled(sizes)
 
 
 def prepared(config: Config, progress: Progress) -> Config:
@@ -68,14 +55,14 @@ def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress |
 
 def timed(config: Config, device: str) -> Config:
     """``config`` under which speed is measured: with no more rays in a step than it takes to be as fast."""
-    assert config.batch_rays is not None, "plan() chooses it"
-    return config.model_copy(update={"batch_rays": min(config.batch_rays, MAX_TIMED_RAYS[device] * cores())})
+    rays = {"batch_rays": min(rays_per_step(config), MAX_TIMED_RAYS[device] * cores())}
+    return config.model_copy(update={"vanilla": config.vanilla.model_copy(update=rays)})
 
 
-def rays_per_step(config: Config) -> float:
+def rays_per_step(config: Config) -> int:
     """Rays of one step."""
-    assert config.batch_rays is not None, "plan() chooses it"
-    return config.batch_rays
+    assert config.vanilla.batch_rays is not None, "plan() chooses it"
+    return config.vanilla.batch_rays
 
 
 def work(config: Config, rays: float) -> str:
@@ -86,23 +73,22 @@ def work(config: Config, rays: float) -> str:
 def memory_bytes(config: Config, workers: int) -> float:
     """Memory on the CPU that training takes beside the photos, so many chunks of work at a time."""
     sizes = field_settings(config)
-    assert config.batch_rays, "plan() chooses it"
-    rays = min(CHUNK_RAYS["cpu"], config.batch_rays)
+    rays = min(CHUNK_RAYS["cpu"], rays_per_step(config))
     samples = rays * (2 * sizes.samples_coarse + sizes.samples_fine)
     return workers * ACTIVATIONS_PER_LAYER * 4 * samples * sizes.width * sizes.depth
 
 
 def memory_advice(config: Config) -> tuple[str, str]:
     """What takes that memory, and how it would take less."""
-    why = f"{config.depth} × {config.width} networks on {cores()} cores at a time take"
-    hint = "Give a smaller --train.width, --train.batch-rays or --train.samples-fine, or fewer cores (taskset)."
-    return why, hint
+    why = f"{sizes_in_words(config)} networks on {cores()} cores at a time take"
+    options = "--train.vanilla.width, --train.vanilla.batch-rays or --train.vanilla.samples-fine"
+    return why, f"Give a smaller {options}, or fewer cores (taskset)."
 
 
 def matmul_width(config: Config) -> int:
     """Of the matrix multiplications."""
-    assert config.width, "plan() chooses it"
-    return config.width
+    assert config.vanilla.width, "plan() chooses it"
+    return config.vanilla.width
 
 
 def table_rows(config: Config) -> int:
@@ -112,7 +98,7 @@ def table_rows(config: Config) -> int:
 
 def sizes_in_words(config: Config) -> str:
     """``8 × 256``."""
-    return f"{config.depth} × {config.width}"
+    return f"{config.vanilla.depth} × {config.vanilla.width}"
 
 
 def step_in_words(config: Config) -> str | None:
@@ -124,14 +110,15 @@ def make_trainer(
     config: Config, scene: "Scene", dataset: "RayDataset", seed: int, effects: ImageEffects
 ) -> VanillaTrainer:
     """A fresh field with its trainer, where ``dataset`` is."""
-    assert config.batch_rays is not None and config.learning_rate is not None, "plan() chooses them"
+    assert config.learning_rate is not None, "plan() chooses it"
     model = VanillaNerf(field_settings(config), seed).to(dataset.device)
     rates = (config.learning_rate, config.learning_rate * FINAL_LEARNING_RATE)
-    settings = VanillaTrainerSettings(config.batch_rays, seed, training_background(config, scene), *rates)
+    settings = VanillaTrainerSettings(rays_per_step(config), seed, training_background(config, scene), *rates)
     return VanillaTrainer(model, dataset, settings, effects)
 
 
 def field_settings(config: Config) -> VanillaSettings:
     """Sizes and ablations of the field."""
-    of_config = {part.name: getattr(config, part.name) for part in fields(VanillaSettings) if part.name != "space"}
-    return VanillaSettings(**of_config, space=space_of(config))
+    assert config.contracted is not None and config.view_dependence is not None, "plan() takes them from stage effects"
+    sizes = config.vanilla.model_dump(exclude={"batch_rays"})
+    return VanillaSettings(space=space_of(config), view_dependence=config.view_dependence, **sizes)

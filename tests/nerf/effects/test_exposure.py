@@ -13,16 +13,16 @@ from nerf.effects.appearance import AppearanceModel
 from nerf.effects.exposure import ExposureModel, expose, expose_backward, fit_log_gain
 from nerf.fields.interface import RadianceModel, Rendering
 from nerf.geometry.rays import Rays
-from nerf.rendering.srgb import KNEE, linear_to_srgb, srgb_to_linear
+from nerf.rendering.srgb import LINEAR_THRESHOLD, linear_to_srgb, srgb_to_linear
 
-EXTREMES = [0.0, 1e-30, 1e-8, 0.04, KNEE, 0.0405, 0.5, 1.0, 2.0, 1e4, 1e12, 1e20, 1e30]
+EXTREMES = [0.0, 1e-30, 1e-8, 0.04, LINEAR_THRESHOLD, 0.0405, 0.5, 1.0, 2.0, 1e4, 1e12, 1e20, 1e30]
 gains = st.floats(-3, 3)
 
 
 def colours(count: int = 3000, brightest: float = 1.2) -> Tensor:
-    """In float64, half of them about the knee."""
+    """In float64, half of them about the threshold of the sRGB curve."""
     random = torch.Generator().manual_seed(1)
-    scale = torch.where(torch.arange(count) % 2 == 0, brightest, 3 * KNEE)[:, None]
+    scale = torch.where(torch.arange(count) % 2 == 0, brightest, 3 * LINEAR_THRESHOLD)[:, None]
     return scale * torch.rand(count, 3, generator=random, dtype=torch.float64)
 
 
@@ -83,7 +83,7 @@ def test_exposing_stays_finite(log_gain: float):
 
 def test_gradients_are_those_of_finite_differences():
     c, g = colours(40), gain(-0.6, 0.2, 0.9) * torch.linspace(-1, 1, 40, dtype=torch.float64)[:, None]
-    on_one_side = ((c - KNEE).abs() > 1e-4) & ((expose(c, g) - KNEE).abs() > 1e-4)
+    on_one_side = ((c - LINEAR_THRESHOLD).abs() > 1e-4) & ((expose(c, g) - LINEAR_THRESHOLD).abs() > 1e-4)
     rows = on_one_side.all(-1)
     assert rows.sum() > 20
     c, g = c[rows].requires_grad_(), g[rows].requires_grad_()

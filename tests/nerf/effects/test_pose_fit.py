@@ -17,12 +17,12 @@ FIELD = HashGridSettings(
 class Small(HashGridField):
     """What the same field is in a scene that is smaller by SMALLER."""
 
-    def forward(self, rays: Rays, jitter: Tensor, offset: Tensor, background: Tensor) -> HashGridPass:
+    def forward(self, rays: Rays, jitter: Tensor, thinning_offset: Tensor, background: Tensor) -> HashGridPass:
         large = Rays(rays.origins / SMALLER, rays.directions, rays.near / SMALLER, rays.far / SMALLER)
-        return super().forward(large, jitter, offset, background)
+        return super().forward(large, jitter, thinning_offset, background)
 
-    def rays_backward(self, done: HashGridPass, gradients: HashGridGradients) -> tuple[Tensor, Tensor]:
-        origins, directions = super().rays_backward(done, gradients)
+    def rays_backward(self, forward_pass: HashGridPass, gradients: HashGridGradients) -> tuple[Tensor, Tensor]:
+        origins, directions = super().rays_backward(forward_pass, gradients)
         return origins / SMALLER, directions
 
 

@@ -31,7 +31,7 @@ FIELD = HashGridSettings(
     occupancy_resolution=16,
     space=Contraction(),
 )
-TRAINER = HashGridTrainerSettings(seed=3, background=(0.0, 0.0, 0.0), samples=1024, least_photos=3)
+TRAINER = HashGridTrainerSettings(seed=3, background=(0.0, 0.0, 0.0), target_samples=1024, min_photos=3)
 
 
 def dataset(count: int = 4, half: float = HALF) -> RayDataset:
@@ -64,7 +64,7 @@ def middles(cells: int) -> torch.Tensor:
 def projected(views: RayDataset, points: torch.Tensor, near: float, half: float) -> torch.Tensor:
     """How many photos have the points in their picture, between ``near`` and far."""
     photos = torch.zeros(len(points), dtype=torch.int32)
-    for geometry in views.geometry.T:
+    for geometry in views.view_geometry.T:
         local = (points - geometry[9:12]) @ geometry[:9].view(3, 3)
         inside = (local[:, :2].abs() <= half * (1 - 1 / SIZE) * local[:, 2:]).all(-1) & (local[:, 2] > 0)
         distance = local.norm(dim=-1)
@@ -156,5 +156,5 @@ def test_nothing_is_ever_sampled_elsewhere_nor_found_there() -> None:
 )
 def test_where_the_rule_says_nothing_all_of_space_is_used(views: RayDataset, space: SpaceMap, least: int) -> None:
     field = HashGridField(replace(FIELD, space=space), 0, reference)
-    HashGridTrainer(field, views, replace(TRAINER, least_photos=least))
+    HashGridTrainer(field, views, replace(TRAINER, min_photos=least))
     assert (field.occupancy_bits == -1).all()

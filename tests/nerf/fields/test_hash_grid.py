@@ -61,10 +61,10 @@ def seen_by_autograd(model: HashGridField, given: Rays, jitter: Tensor, backgrou
         on_sphere = encoded_by_autograd(BACKGROUND_LAYOUT, model.background_table, (given.directions + 1) / 2)
         background = torch.sigmoid(on_sphere.view(len(on_sphere), -1, 4).sum(1))[:, :3]
     weights = model.weights
-    geometry = torch.relu(features @ weights.density_hidden) @ weights.density_out.T
-    sigma = geometry[:, 0].clamp(max=15).exp()
-    harmonics = model.of_directions(given.directions)[samples.ray]
-    hidden = torch.relu(torch.cat([geometry, harmonics], -1) @ weights.colour_hidden)
+    geometry_features = torch.relu(features @ weights.density_hidden) @ weights.density_out.T
+    sigma = geometry_features[:, 0].clamp(max=15).exp()
+    harmonics = model.encode_directions(given.directions)[samples.ray]
+    hidden = torch.relu(torch.cat([geometry_features, harmonics], -1) @ weights.colour_hidden)
     rendering, _ = reference.composite(
         samples, sigma, torch.sigmoid(hidden @ weights.colour_out.T), background, given.far
     )
@@ -81,11 +81,11 @@ def encoded_by_autograd(layout: GridLayout, table: Tensor, points: Tensor) -> Te
         for corner in torch.cartesian_prod(*[torch.arange(2)] * 3):
             share = torch.where(corner.bool(), inside, 1 - inside).prod(-1)
             x, y, z = (cell.long() + corner).unbind(-1)
-            if layout.hashed(level):
+            if layout.is_hashed(level):
                 number = (x ^ (y * 2654435761) ^ (z * 805459861)) % layout.level_rows(level)
             else:
                 number = (x * (resolution + 1) + y) * (resolution + 1) + z
-            value = value + share[:, None] * table[layout.first_rows[level] + number]
+            value = value + share[:, None] * table[layout.level_offsets[level] + number]
         features.append(value)
     return torch.cat(features, -1)
 
@@ -98,14 +98,14 @@ def test_all_gradients_are_those_of_autograd(settings: HashGridSettings, monkeyp
     jitter = torch.rand(6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     background = torch.rand(6, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     done = model.forward(given, jitter, jitter, background)
-    assert done.marched == len(done.samples.t), "these are to be compared without early termination"
+    assert done.density_evaluations == len(done.samples.t), "these are to be compared without early termination"
     ones = torch.ones(6, dtype=torch.float64)
     grad = Rendering(torch.tensor([1.0, 2.0, -3.0], dtype=torch.float64).expand(6, 3), ones, 0 * ones)
     gradients = model.backward(done, grad, torch.zeros_like(done.weights))
     grad_table = torch.zeros_like(model.table)
     for level in range(2):
         reference.encode_backward_table(model.layout, level, done.points, gradients.features, grad_table)
-    of_rays = model.rays_backward(done, gradients)
+    ray_hidden = model.rays_backward(done, gradients)
 
     of_sky = [model.background_backward(done, gradients)] if settings.background_model else []
 
@@ -115,14 +115,14 @@ def test_all_gradients_are_those_of_autograd(settings: HashGridSettings, monkeyp
         parameter.requires_grad_()
     wanted = torch.autograd.grad(seen_by_autograd(model, given, jitter, background), parameters)
     assert all(part.abs().max() > 1e-3 for part in wanted)
-    torch.testing.assert_close((grad_table, *gradients.weights, *of_sky, *of_rays), wanted, rtol=1e-9, atol=1e-10)
+    torch.testing.assert_close((grad_table, *gradients.weights, *of_sky, *ray_hidden), wanted, rtol=1e-9, atol=1e-10)
 
 
 def test_density_is_bounded_in_value_and_gradient() -> None:
     logits = torch.tensor([-1e30, -100.0, 0.0, 15.0, 16.0, 1e30])
-    geometry = torch.zeros(6, 16)
-    geometry[:, 0] = logits
-    sigma = mlp.sigma_of(geometry)
+    geometry_features = torch.zeros(6, 16)
+    geometry_features[:, 0] = logits
+    sigma = mlp.sigma_of(geometry_features)
     assert sigma.isfinite().all()
     assert sigma.max() == pytest.approx(math.exp(15))
     assert sigma[2] == 1
@@ -220,9 +220,9 @@ def test_a_new_sky_is_a_grey_background_bit_for_bit(backend: Backend) -> None:
 @BACKENDS
 def test_zero_view_dependence_is_diffuse_bit_for_bit(backend: Backend) -> None:
     dependent, diffuse = HashGridField(SMALL, 1, backend), HashGridField(DIFFUSE, 1, backend)
-    dependent.colour_hidden[mlp.GEOMETRY :] = 0
+    dependent.colour_hidden[mlp.GEOMETRY_FEATURES :] = 0
     weights = dependent.state_dict()
-    diffuse.load_state_dict(weights | {"colour_hidden": weights["colour_hidden"][: mlp.GEOMETRY]})
+    diffuse.load_state_dict(weights | {"colour_hidden": weights["colour_hidden"][: mlp.GEOMETRY_FEATURES]})
     assert_same_field(dependent, diffuse)
 
 
@@ -293,8 +293,8 @@ def in_one_pass(
     samples = reference.march(binary_occupancy(model.occupancy_bits), stepping, given, jitter)
     density = model._density_pass(reference.sample_points(given, samples, model.space.bends_rays))
     front, seen = reference.visible_samples(samples, density.sigma, EARLY_STOP_TRANSMITTANCE, thin, jitter)
-    of_rays = mlp.ray_hidden(model.weights, reference.spherical_harmonics(given.directions))
-    colour = mlp.colour_forward(model.weights, reference, front, density.geometry[seen], of_rays).colour
+    ray_hidden = mlp.direction_hidden(model.weights, reference.spherical_harmonics(given.directions))
+    colour = mlp.colour_forward(model.weights, reference, front, density.geometry_features[seen], ray_hidden).colour
     behind = background.repeat(len(jitter), 1)
     rendering, _ = reference.composite(front, density.sigma[seen], colour, behind, given.far)
     return len(samples.t), front, rendering
@@ -319,11 +319,11 @@ def test_waves_through_thin_fog_see_what_a_single_pass_sees(
     model.set_occupancy(
         model.occupancy_bits.random_(generator=torch.Generator().manual_seed(5))
     )  # half of the cells are closed
-    marched, front, whole = in_one_pass(
+    density_evaluations, front, whole = in_one_pass(
         model, model.render_stepping, given, torch.full_like(given.near, 0.5), background
     )
     rounds, asked = in_rounds(model, given, background)
-    assert asked == marched == len(front.t) > 40
+    assert asked == density_evaluations == len(front.t) > 40
     assert whole.opacity.min() < 0.5 < whole.opacity.max()
     torch.testing.assert_close(tuple(rounds), tuple(whole), rtol=1e-9, atol=1e-9)
 
@@ -334,11 +334,11 @@ def test_waves_end_soon_behind_what_stops_the_light(
 ) -> None:
     in_short_rounds(monkeypatch, 80, 2, 64)
     model, given, background = dense_field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    marched, front, whole = in_one_pass(
+    density_evaluations, front, whole = in_one_pass(
         model, model.render_stepping, given, torch.full_like(given.near, 0.5), background
     )
     rounds, asked = in_rounds(model, given, background)
-    assert len(front.t) < asked < 0.7 * marched
+    assert len(front.t) < asked < 0.7 * density_evaluations
     assert whole.opacity.min() > 0.99
     left = EARLY_STOP_TRANSMITTANCE * torch.tensor([1.0, 5.0, 1.0])  # of a ray's colour, depth and opacity
     for one, other, most in zip(rounds, whole, left, strict=True):
@@ -389,9 +389,11 @@ def test_training_keeps_all_samples_whatever_the_rounds(
     model.set_occupancy(model.occupancy_bits.random_(generator=torch.Generator().manual_seed(5)))
     jitter = torch.rand(40, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
     background = torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    marched, front, whole = in_one_pass(model, model.stepping, given, jitter, background, THINNING_THRESHOLD)
+    density_evaluations, front, whole = in_one_pass(
+        model, model.stepping, given, jitter, background, THINNING_THRESHOLD
+    )
     done = model.forward(given, jitter, jitter, background.repeat(40, 1))
-    assert done.marched < marched if dense else done.marched == marched
+    assert done.density_evaluations < density_evaluations if dense else done.density_evaluations == density_evaluations
     assert torch.equal(done.samples.starts, front.starts) and torch.equal(done.samples.ray, front.ray)
     torch.testing.assert_close(done.samples[2:], front[2:], rtol=1e-9, atol=1e-12)
     torch.testing.assert_close(tuple(done.rendering), tuple(whole), rtol=1e-9, atol=1e-9)
@@ -412,7 +414,7 @@ def test_thin_samples_that_stand_for_others_keep_picture_and_gradients(
     def seen_and_gradients(offset: float) -> tuple[int, list[Tensor]]:
         done = model.forward(given, jitter, torch.full_like(jitter, offset), background)
         gradients = model.backward(done, grad, torch.zeros_like(done.weights))
-        probability = done.thickness / (done.density.sigma * done.samples.dt)
+        probability = done.optical_thickness / (done.density.sigma * done.samples.dt)
         assert 1 / 17 < probability.min() <= probability.max() < 1.001
         return len(done.points), [*done.rendering, *gradients.weights]
 
@@ -431,7 +433,7 @@ def test_a_ray_ends_after_the_most_samples_it_may_have(monkeypatch: pytest.Monke
     model, given = field(replace(SMALL, max_samples_per_ray=7)), rays(40)
     middle = torch.full_like(given.near, 0.5)
     done = model.forward(given, middle, middle, torch.zeros(40, 3, dtype=torch.float64))
-    assert done.marched == 7 * 40 and done.samples.starts.diff().max() <= 7
+    assert done.density_evaluations == 7 * 40 and done.samples.starts.diff().max() <= 7
 
 
 def dense_field(settings: HashGridSettings) -> HashGridField:

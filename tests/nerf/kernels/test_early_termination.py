@@ -115,8 +115,8 @@ def test_waves_are_packed_ray_by_ray_in_their_order(backend: Backend) -> None:
         for ray in range(len(COUNTS)):
             wanted[ray] += range(before + int(each.starts[ray]), before + int(each.starts[ray + 1]))
         before += len(each.t)
-    assert order.tolist() == [place for of_ray in wanted for place in of_ray]
-    assert samples.starts.diff().tolist() == [len(of_ray) for of_ray in wanted]
+    assert order.tolist() == [place for ray_hidden in wanted for place in ray_hidden]
+    assert samples.starts.diff().tolist() == [len(ray_hidden) for ray_hidden in wanted]
     assert samples.starts.dtype == samples.ray.dtype == order.dtype == torch.int32
     assert torch.equal(samples.ray, torch.repeat_interleave(torch.arange(8), samples.starts.diff()).int())
     assert torch.equal(samples.t, t[order]) and torch.equal(samples.dt, torch.cat([w.dt for w in rounds])[order])

@@ -11,9 +11,9 @@ CPU = torch.device("cpu")
 
 
 def test_rates_are_plausible_and_keep_random_state(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine_rates, "STREAMED", 1 << 18)
-    monkeypatch.setattr(machine_rates, "MIN_STREAMED", 1 << 16)
-    monkeypatch.setattr(machine_rates, "GATHERED", 1 << 12)
+    monkeypatch.setattr(machine_rates, "STREAMED_FLOATS", 1 << 18)
+    monkeypatch.setattr(machine_rates, "MIN_STREAMED_FLOATS", 1 << 16)
+    monkeypatch.setattr(machine_rates, "GATHERED_ROWS", 1 << 12)
     before = torch.get_rng_state()
     rates = measure_rates(CPU, width=16, rows=1 << 10, seconds=0.05)
     assert torch.equal(before, torch.get_rng_state())
@@ -22,7 +22,7 @@ def test_rates_are_plausible_and_keep_random_state(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_clock_that_moves_in_long_steps_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine_rates, "GATHERED", 1 << 12)
+    monkeypatch.setattr(machine_rates, "GATHERED_ROWS", 1 << 12)
     rate = machine_rates.measure_gather(CPU, 1 << 10, 0.2)
     monkeypatch.setattr(Profiler, "now", lambda _: time.thread_time() // 0.016 * 0.016)  # as on Windows
     assert 1 / 4 < machine_rates.measure_gather(CPU, 1 << 10, 0.2) / rate < 4

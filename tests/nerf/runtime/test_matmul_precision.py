@@ -8,8 +8,8 @@ import torch
 from nerf.runtime import matmul_precision
 from nerf.runtime.matmul_precision import (
     MAX_MATMUL_ERROR,
-    Medium,
-    error_of,
+    MediumPrecision,
+    matmul_error,
     measure_medium_matmul,
     use_matmul_precision,
 )
@@ -29,10 +29,11 @@ def rounded(values: torch.Tensor, bits: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    "speedup, error, pays", [(1.3, 1e-4, True), (1.29, 0.0, False), (5.0, 1.1e-4, False), (5.0, math.nan, False)]
+    "speedup, error, is_worthwhile",
+    [(1.3, 1e-4, True), (1.29, 0.0, False), (5.0, 1.1e-4, False), (5.0, math.nan, False)],
 )
-def test_it_pays_where_it_is_faster_and_about_as_exact(speedup: float, error: float, pays: bool) -> None:
-    assert Medium(speedup, error).pays is pays
+def test_it_pays_where_it_is_faster_and_about_as_exact(speedup: float, error: float, is_worthwhile: bool) -> None:
+    assert MediumPrecision(speedup, error).is_worthwhile is is_worthwhile
 
 
 def test_the_setting_is_put_back_whatever_happens() -> None:
@@ -54,8 +55,8 @@ def test_the_fastest_of_several_counts(seconds: dict[str, float], speedup: float
         asked.append((torch.get_float32_matmul_precision(), *a.shape, *b.shape))
         return seconds.get(asked[-1][0], 1.0) * (3.0 if len(asked) < 5 else 1.0)
 
-    monkeypatch.setattr(matmul_precision, "TRIED_SECONDS", 0.0)
-    monkeypatch.setattr(matmul_precision, "seconds_of_product", made_up)
+    monkeypatch.setattr(matmul_precision, "TRIAL_SECONDS", 0.0)
+    monkeypatch.setattr(matmul_precision, "matmul_seconds", made_up)
     found = measure_medium_matmul(CPU, 64)
     assert found.speedup == speedup and 0 <= found.error < 0.1
     assert asked == [("highest", 8192, 64, 64, 64), ("medium", 8192, 64, 64, 64)] * 3
@@ -81,6 +82,6 @@ def test_it_is_measured_here_without_touching_random_state() -> None:
 def test_float32_is_exact_enough_and_fewer_bits_inside_are_not() -> None:
     random = torch.Generator().manual_seed(1)
     a, b = torch.randn(2048, 64, generator=random), torch.randn(64, 64, generator=random)
-    assert 0 < error_of(a @ b, a, b) < MAX_MATMUL_ERROR / 100
-    tf32, bfloat16 = (error_of(rounded(a, bits) @ rounded(b, bits), a, b) for bits in (10, 7))
+    assert 0 < matmul_error(a @ b, a, b) < MAX_MATMUL_ERROR / 100
+    tf32, bfloat16 = (matmul_error(rounded(a, bits) @ rounded(b, bits), a, b) for bits in (10, 7))
     assert 2 * MAX_MATMUL_ERROR < tf32 < 1e-3 < bfloat16 < 1e-2

@@ -13,6 +13,7 @@ from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.rays import Rays
 from nerf.geometry.space_maps import Contraction
 from nerf.kernels import torch as reference
+from nerf.training.evaluation_pixels import evaluate, sample_evaluation_pixels
 from nerf.training.hash_grid_trainer import (
     HashGridBatch,
     HashGridTrainer,
@@ -22,13 +23,12 @@ from nerf.training.hash_grid_trainer import (
 )
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from nerf.training.trainer import FieldTrainer, NonFinite
-from nerf.training.validation_probe import make_probe, measure
 
 FIELD = HashGridSettings(
     num_levels=2, log2_hashmap_size=10, base_res=4, max_res=16, diagonal_steps=32, occupancy_resolution=16
 )
 BACKGROUND = (0.2, 0.9, 0.5)
-TRAINER = HashGridTrainerSettings(seed=3, background="random", samples=1024)
+TRAINER = HashGridTrainerSettings(seed=3, background="random", target_samples=1024)
 
 
 def small_dataset(size: int = 12) -> RayDataset:
@@ -61,11 +61,11 @@ def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
 
 def test_it_trains_behind_the_common_interface() -> None:
     run: FieldTrainer = trainer()
-    probe = make_probe(small_dataset(), 288, torch.ones(3), seed=5)
-    before = measure(run.model, probe).psnr
+    probe = sample_evaluation_pixels(small_dataset(), 288, torch.ones(3), seed=5)
+    before = evaluate(run.model, probe).psnr
     for step in range(80):
         run.step(step, step / 80, 1.0)
-    after = measure(run.model, probe).psnr
+    after = evaluate(run.model, probe).psnr
     assert before < probe.mean_colour_psnr < probe.mean_colour_psnr + 5 < after < 60
 
 
@@ -82,7 +82,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit() -> None:
 
 
 def test_results_do_not_depend_on_the_number_of_threads() -> None:
-    settings = replace(TRAINER, samples=3 << 12)
+    settings = replace(TRAINER, target_samples=3 << 12)
     threads, states = torch.get_num_threads(), []
     try:
         for count in (1, 2, 3):
@@ -97,22 +97,24 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 
 
 def test_a_batchs_gradient_is_the_sum_over_chunks() -> None:
-    run = trainer(replace(TRAINER, samples=1 << 14, distortion=0.1, depth_loss=0.2, chunks=4))
+    run = trainer(replace(TRAINER, target_samples=1 << 14, distortion_weight=0.1, depth_weight=0.2, micro_batches=4))
     run.dataset = run.dataset.with_sparse_depths(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
-    rays = run._rays_per_chunk()
-    parts = [run._part(0, 0.25, rays, chunk) for chunk in range(4)]
-    assert sum(int((part.batch.distance > 0).sum()) for part in parts) == 4 * rays // 8
+    rays = run._rays_per_micro_batch()
+    parts = [run._compute_micro_batch(0, 0.25, rays, chunk) for chunk in range(4)]
+    assert sum(int((part.batch.sparse_depth > 0).sum()) for part in parts) == 4 * rays // 8
     assert rays > 10 and not torch.equal(parts[0].batch.target, parts[1].batch.target)
     whole = HashGridBatch(
         Rays(*(torch.cat(part) for part in zip(*(part.batch.rays for part in parts), strict=True))),
         *(torch.cat(part) for part in zip(*(part.batch[1:] for part in parts), strict=True)),
     )
-    done = run.model.forward(whole.rays, whole.jitter, whole.offset, whole.background)
+    done = run.model.forward(whole.rays, whole.jitter, whole.thinning_offset, whole.background)
     loss = run._loss(4 * rays, 0.25, done, whole)
     gradients = run.model.backward(done, loss.grad, loss.grad_weights)
-    summed = [torch.stack(of_parts).sum(0) for of_parts in zip(*(part.weights for part in parts), strict=True)]
+    summed = [torch.stack(of_parts).sum(0) for of_parts in zip(*(part.grad_networks for part in parts), strict=True)]
     torch.testing.assert_close(summed, list(gradients.weights), rtol=1e-4, atol=1e-9)
-    torch.testing.assert_close(torch.cat([part.features for part in parts]), gradients.features, rtol=1e-4, atol=1e-9)
+    torch.testing.assert_close(
+        torch.cat([part.grad_features for part in parts]), gradients.features, rtol=1e-4, atol=1e-9
+    )
     torch.testing.assert_close(sum(part.loss for part in parts), loss.value)
 
 
@@ -120,7 +122,12 @@ def test_rays_adapt_to_the_samples_they_need() -> None:
     run = trainer()
     results = [run.step(step, 0.5) for step in range(100)]
     assert results[0].rays == 1024 // 128
-    assert results[0].rays < results[0].samples <= results[0].densities <= results[0].rays * FIELD.stepping.max_samples
+    assert (
+        results[0].rays
+        < results[0].colour_evaluations
+        <= results[0].density_evaluations
+        <= results[0].rays * FIELD.stepping.max_samples
+    )
     needed = results[-1].rays * float(run.samples_per_ray)
     assert 0.7 * 1024 < needed < 1.4 * 1024
     assert results[-1].rays > 5 * results[0].rays
@@ -159,7 +166,15 @@ def test_a_non_finite_step_changes_nothing_and_shows_its_batch(
         run.step(1, 0.5)
     for name, tensor in run.state().items():
         torch.testing.assert_close(tensor, before[name], rtol=0, atol=0, equal_nan=True)
-    assert set(caught.value.batch) == {*Rays._fields, "target", "background", "jitter", "offset", "view", "distance"}
+    assert set(caught.value.batch) == {
+        *Rays._fields,
+        "target",
+        "background",
+        "jitter",
+        "thinning_offset",
+        "view",
+        "sparse_depth",
+    }
 
 
 def test_the_rate_scale_scales_the_update() -> None:
@@ -174,7 +189,7 @@ def test_the_rate_scale_scales_the_update() -> None:
 
 
 def test_the_distortion_loss_is_added_and_has_its_gradient() -> None:
-    plain, with_it = trainer(), trainer(replace(TRAINER, distortion=1.0))
+    plain, with_it = trainer(), trainer(replace(TRAINER, distortion_weight=1.0))
     one, other = plain.step(0, 1.0), with_it.step(0, 1.0)
     assert one.psnr == other.psnr
     assert one.loss < other.loss < one.loss + 5
@@ -183,7 +198,9 @@ def test_the_distortion_loss_is_added_and_has_its_gradient() -> None:
 
 
 def test_the_distortion_loss_begins_weak() -> None:
-    losses = [trainer(replace(TRAINER, distortion=1.0)).step(0, share).loss for share in (0.0, 0.05, 0.15, 0.3, 1.0)]
+    losses = [
+        trainer(replace(TRAINER, distortion_weight=1.0)).step(0, share).loss for share in (0.0, 0.05, 0.15, 0.3, 1.0)
+    ]
     bare = trainer().step(0, 0.0).loss
     added = [(loss - bare) / (losses[-1] - bare) for loss in losses]
     assert added == pytest.approx([0.25, 0.25, 0.5, 1, 1], rel=1e-4)
@@ -191,7 +208,7 @@ def test_the_distortion_loss_begins_weak() -> None:
 
 def test_unbounded_scenes_train_too() -> None:
     run = trainer(
-        replace(TRAINER, background=(0.0, 0.0, 0.0), distortion=1e-3),
+        replace(TRAINER, background=(0.0, 0.0, 0.0), distortion_weight=1e-3),
         replace(FIELD, space=Contraction(), min_step_size=0.05, cone_angle=0.1),
     )
     results = [run.step(step, step / 60) for step in range(60)]
@@ -232,8 +249,8 @@ def unequal_dataset() -> RayDataset:
     half = len(dataset.pixels) // 2
     colour = dataset.pixels[:half, :3].where(dataset.pixels[:half, 3:] > 0, 0)
     darker = (255 * expose(colour / 255, torch.full((3,), -math.log(2)))).round().byte()
-    geometry = dataset.geometry[:, :1].repeat(1, 2)
-    return dataset._replace(pixels=torch.cat([colour, darker]), geometry=geometry)
+    geometry = dataset.view_geometry[:, :1].repeat(1, 2)
+    return dataset._replace(pixels=torch.cat([colour, darker]), view_geometry=geometry)
 
 
 def test_exposures_are_learnt_where_they_are_modelled() -> None:
@@ -255,14 +272,14 @@ def test_the_gradient_of_poses_is_that_of_the_loss(seed: int) -> None:
     run = HashGridTrainer(HashGridField(FIELD, seed, reference), small_dataset(), settings, ImageEffects((poses,)))
     for step in range(60):
         run.step(step, 0.84)  # at a third of the rate
-    by_hand = run._part(7, 0.5, 128, 0).effects
+    by_hand = run._compute_micro_batch(7, 0.5, 128, 0).grad_effects
     assert set(by_hand) == {"pose_refinement.turn", "pose_refinement.offset"}
 
     def difference(part: Tensor, view: int, axis: int) -> float:
         losses = []
         for sign in (1, -1):
             part[view, axis] += sign * 2e-3
-            losses.append(float(run._part(7, 0.5, 128, 0).loss))
+            losses.append(float(run._compute_micro_batch(7, 0.5, 128, 0).loss))
             part[view, axis] -= sign * 2e-3
         return (losses[0] - losses[1]) / 4e-3
 
@@ -311,7 +328,7 @@ def test_the_sky_becomes_what_is_seen_in_its_direction() -> None:
     dataset = dataset._replace(pixels=colours.repeat_interleave(len(dataset.pixels) // 2, 0))
     outdoors = replace(FIELD, space=Contraction(), min_step_size=0.05, cone_angle=0.1, background_model=True)
     run = HashGridTrainer(
-        HashGridField(outdoors, 0, reference), dataset, replace(TRAINER, background=(0.0, 0.0, 0.0), rate=1e-2)
+        HashGridField(outdoors, 0, reference), dataset, replace(TRAINER, background=(0.0, 0.0, 0.0), learning_rate=1e-2)
     )
     for step in range(20):
         run.step(step, step / 20)
@@ -328,7 +345,7 @@ def test_known_distances_decide_a_shape_that_colours_leave_open() -> None:
     dataset = small_dataset()
     grey = dataset._replace(pixels=torch.full_like(dataset.pixels[:, :3], 128))
     guided = grey.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
-    settings = replace(TRAINER, background=(0.0, 0.0, 0.0), depth_loss=0.1)
+    settings = replace(TRAINER, background=(0.0, 0.0, 0.0), depth_weight=0.1)
     centre, depth = grey.lookup(torch.tensor([78])).rays, {}
     for name, photos in {"open": grey, "guided": guided}.items():
         run = HashGridTrainer(HashGridField(FIELD, 0, reference), photos, settings)
@@ -339,7 +356,7 @@ def test_known_distances_decide_a_shape_that_colours_leave_open() -> None:
 
 
 def test_points_guide_a_run_less_and_less() -> None:
-    settings = replace(TRAINER, depth_loss=0.1)
+    settings = replace(TRAINER, depth_weight=0.1)
     plain, guided = trainer(settings), trainer(settings)
     guided.dataset = guided.dataset.with_sparse_depths(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
     assert depth_loss_multiplier(0.0) == 1 and depth_loss_multiplier(0.25) == 0.75 and depth_loss_multiplier(1.0) == 0
@@ -351,10 +368,10 @@ def test_points_guide_a_run_less_and_less() -> None:
 
 
 def test_the_depth_loss_fades_in_value_and_gradient() -> None:
-    run = trainer(replace(TRAINER, depth_loss=0.1))
+    run = trainer(replace(TRAINER, depth_weight=0.1))
     run.dataset = run.dataset.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
     batch = run._batch(0, 0.0, 0, 64)
-    done = run.model.forward(batch.rays, batch.jitter, batch.offset, batch.background)
+    done = run.model.forward(batch.rays, batch.jitter, batch.thinning_offset, batch.background)
     early, late, over = (run._loss(64, share, done, batch) for share in (0.25, 0.75, 1.0))
     of_depth = [float(loss.value - over.value) for loss in (early, late)]
     assert of_depth[0] == pytest.approx(3 * of_depth[1]) and of_depth[1] > 0
@@ -366,10 +383,10 @@ def test_the_depth_loss_fades_in_value_and_gradient() -> None:
 
 
 def test_an_eighth_of_the_rays_run_to_points() -> None:
-    run = trainer(replace(TRAINER, depth_loss=0.1))
+    run = trainer(replace(TRAINER, depth_weight=0.1))
     run.dataset = run.dataset.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
     for count in (1, 3, 5, 8, 21):
-        to_points = [int((run._batch(0, 0.1, chunk, count).distance > 0).sum()) for chunk in range(32)]
+        to_points = [int((run._batch(0, 0.1, chunk, count).sparse_depth > 0).sum()) for chunk in range(32)]
         assert sum(to_points) == 32 * count // 8 and max(to_points) - min(to_points) <= 1
 
 
@@ -377,7 +394,7 @@ def test_points_beyond_a_bounded_box_are_no_guide() -> None:
     dataset = small_dataset().with_sparse_depths(torch.tensor([78, 78]), torch.tensor([3.0, 4.5]))
     outdoors = replace(FIELD, space=Contraction(), min_step_size=0.05, cone_angle=0.1)
     for field, distances in {FIELD: [3.0], outdoors: [3.0, 4.5]}.items():
-        kept = HashGridTrainer(HashGridField(field, 0, reference), dataset, TRAINER).dataset.distance
+        kept = HashGridTrainer(HashGridField(field, 0, reference), dataset, TRAINER).dataset.sparse_depths
         assert kept is not None and kept.tolist() == distances
 
 

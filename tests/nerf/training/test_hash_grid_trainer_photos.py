@@ -13,31 +13,31 @@ from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import Rendering
 from nerf.kernels import torch as reference
-from nerf.training.hash_grid_trainer import HashGridTrainer, _Part
+from nerf.training.hash_grid_trainer import HashGridTrainer, _MicroBatch
 from nerf.training.losses import huber_loss
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.trainer import RAYS, NonFinite
+from nerf.training.trainer import RAY_GEOMETRY, NonFinite
 from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, same, small_dataset, trainer
 
 
-def part_without_effects(run: HashGridTrainer, step: int, progress: float, rays: int, chunk: int) -> _Part:
+def part_without_effects(run: HashGridTrainer, step: int, progress: float, rays: int, chunk: int) -> _MicroBatch:
     """What a chunk adds to loss and gradients, written as if there were no effects."""
     batch = run._batch(step, progress, chunk, rays)
-    done = run.model.forward(batch.rays, batch.jitter, batch.offset, batch.background)
+    done = run.model.forward(batch.rays, batch.jitter, batch.thinning_offset, batch.background)
     error = done.rendering.colour - batch.target
-    robust, pull = huber_loss(error)
+    huber, half_gradient = huber_loss(error)
     none = torch.zeros(rays)
-    grad = Rendering(pull * (2 / (3 * rays)), none, none)
+    grad = Rendering(half_gradient * (2 / (3 * rays)), none, none)
     gradients = run.model.backward(done, grad, torch.zeros_like(done.weights))
     norm = torch.nn.utils.get_total_norm([*gradients.weights, gradients.features])
-    losses = robust.sum() / (3 * rays), error.square().sum() / (3 * rays)
+    losses = huber.sum() / (3 * rays), error.square().sum() / (3 * rays)
     learnt = gradients.weights, gradients.features, done.points, dict[str, Tensor](), dict[str, Tensor]()
-    return _Part(batch, *losses, *learnt, norm, done.thickness, done.marched)
+    return _MicroBatch(batch, *losses, *learnt, norm, done.optical_thickness, done.density_evaluations)
 
 
 def test_effects_that_are_off_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     off, without = trainer(), trainer()
-    monkeypatch.setattr(without, "_part", partial(part_without_effects, without))
+    monkeypatch.setattr(without, "_compute_micro_batch", partial(part_without_effects, without))
     for step in range(30):
         assert off.step(step, step / 30) == without.step(step, step / 30)
     assert same(off.state(), without.state())
@@ -51,7 +51,7 @@ def test_turns_that_run_away_are_refused_and_change_nothing(runaway: float) -> N
     run.step(0, 0.0)
     poses.turn[:, 1] = runaway
     before = copied(run.state())
-    with pytest.raises(NonFinite, match=f"the {RAYS} of step 1 is not finite"):
+    with pytest.raises(NonFinite, match=f"the {RAY_GEOMETRY} of step 1 is not finite"):
         run.step(1, 0.1)
     for name, tensor in run.state().items():
         torch.testing.assert_close(tensor, before[name], rtol=0, atol=0, equal_nan=True)
@@ -63,12 +63,12 @@ def test_steps_draw_every_pixel_once_before_any_again(monkeypatch: pytest.Monkey
         small_dataset(16).with_sparse_depths(torch.tensor([136, 392]), torch.tensor([3.0, 2.5])),
         list[Tensor](),
     )
-    assert dataset.known is not None and dataset.unmasked_count == 512
-    monkeypatch.setattr(RayDataset, "nth", lambda _, numbers: drawn.append(numbers) or numbers)
-    settings = replace(TRAINER, chunks=3, depth_loss=0.1)
+    assert dataset.sparse_pixels is not None and dataset.unmasked_count == 512
+    monkeypatch.setattr(RayDataset, "unmasked_pixels", lambda _, numbers: drawn.append(numbers) or numbers)
+    settings = replace(TRAINER, micro_batches=3, depth_weight=0.1)
     run, rays = HashGridTrainer(HashGridField(FIELD, 0, reference), dataset, settings), set[int]()
     for step in range(40):
         rays.add(run.step(step, min(1.0, step / 20)).rays)
     often = torch.cat(drawn).bincount(minlength=512)
-    assert len(rays) > 5 and often.sum() == run.drawn > 1024
+    assert len(rays) > 5 and often.sum() == run.pixels_sampled > 1024
     assert often.max() - often.min() <= 1

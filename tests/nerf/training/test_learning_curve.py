@@ -6,7 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.training.learning_curve import KNEE_DB, MIN_STEPS, knee, last_doubling, next_doubling, quality_at
+from nerf.training.learning_curve import (
+    MIN_DOUBLING_GAIN_DB,
+    MIN_STEPS,
+    diminishing_returns_seconds,
+    last_doubling_gain,
+    predicted_doubling_gain,
+    quality_at,
+)
 
 LATEST = 8.0
 
@@ -35,36 +42,40 @@ def test_no_quality_beyond_the_curve(seconds: float):
 @given(st.floats(-1, 3), st.floats(0.1, 100))
 def test_the_last_doubling_does_not_know_the_unit_of_time(per_doubling: float, unit: float):
     curve = [(seconds * unit, db) for seconds, db in straight(per_doubling)]
-    assert last_doubling(curve) == pytest.approx(per_doubling)
+    assert last_doubling_gain(curve) == pytest.approx(per_doubling)
 
 
 @pytest.mark.parametrize("curve", [[], [(1.0, 20.0)], [(1.0, 20.0), (1.9, 21.0)]])
 def test_a_short_curve_tells_nothing(curve: list[tuple[float, float]]):
-    assert last_doubling(curve) is None and next_doubling(curve, 1000) is None and knee(curve) is None
+    assert (
+        last_doubling_gain(curve) is None
+        and predicted_doubling_gain(curve, 1000) is None
+        and diminishing_returns_seconds(curve) is None
+    )
 
 
-def test_the_knee_is_where_doublings_begin_to_buy_little():
+def test_returns_diminish_where_doublings_begin_to_gain_little():
     # 4, 2, 1, 0.5, 0.25 …: from 16 on less than half a decibel, at 8 just that much.
-    assert knee(saturating(4.0)) == 16.0
+    assert diminishing_returns_seconds(saturating(4.0)) == 16.0
 
 
-@given(st.floats(KNEE_DB, 3))
-def test_no_knee_while_doublings_buy_much(per_doubling: float):
-    assert knee(straight(per_doubling * (1 + 1e-9))) is None
+@given(st.floats(MIN_DOUBLING_GAIN_DB, 3))
+def test_returns_do_not_diminish_while_doublings_gain_much(per_doubling: float):
+    assert diminishing_returns_seconds(straight(per_doubling * (1 + 1e-9))) is None
 
 
-def test_a_flat_curve_is_all_knee():
-    assert knee(straight(0.1)) == 1.0
+def test_returns_of_a_flat_curve_always_diminish():
+    assert diminishing_returns_seconds(straight(0.1)) == 1.0
 
 
-def test_a_late_rise_undoes_a_knee():
+def test_a_late_rise_undoes_diminishing_returns():
     flat_then_steep = [(1.0, 20.0), (2.0, 20.1), (4.0, 20.2), (8.0, 22.0)]
-    assert knee(flat_then_steep) is None
+    assert diminishing_returns_seconds(flat_then_steep) is None
 
 
 @given(st.floats(-1, 4))
 def test_the_next_doubling_buys_less_than_the_last(last: float):
-    coming = next_doubling(straight(last), MIN_STEPS)
+    coming = predicted_doubling_gain(straight(last), MIN_STEPS)
     assert coming is not None
     assert coming.db == pytest.approx(0.71 * last) and 0 < coming.half_width < 0.5
-    assert next_doubling(straight(last), MIN_STEPS - 1) is None
+    assert predicted_doubling_gain(straight(last), MIN_STEPS - 1) is None

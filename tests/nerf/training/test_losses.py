@@ -5,9 +5,9 @@ from nerf.training.losses import HUBER_DELTA, huber_loss
 
 
 def test_small_errors_are_squared_and_large_ones_pull_no_harder() -> None:
-    loss, pull = huber_loss(torch.tensor([0.05, -0.05, 0.3, -0.3]))
+    loss, half_gradient = huber_loss(torch.tensor([0.05, -0.05, 0.3, -0.3]))
     torch.testing.assert_close(loss, torch.tensor([0.0025, 0.0025, 0.05, 0.05]))
-    torch.testing.assert_close(pull, torch.tensor([0.05, -0.05, HUBER_DELTA, -HUBER_DELTA]))
+    torch.testing.assert_close(half_gradient, torch.tensor([0.05, -0.05, HUBER_DELTA, -HUBER_DELTA]))
 
 
 def test_huber_gradient_is_half_the_derivative() -> None:

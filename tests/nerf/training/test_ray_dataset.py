@@ -46,7 +46,7 @@ def test_the_fourth_channel_is_alpha() -> None:
 def test_samples_are_uniform_over_pixels() -> None:
     dataset, *_ = scattered()
     count = 38_000  # a thousand for each of the 38 pixels
-    near = dataset.lookup(dataset.draw(count, generator("cpu", 0))).rays.near
+    near = dataset.lookup(dataset.sample_pixels(count, generator("cpu", 0))).rays.near
     for view, (height, width) in enumerate(SIZES):
         expected = count * height * width / 38
         assert abs((near == view + 1).sum() - expected) < 4 * expected**0.5
@@ -54,7 +54,7 @@ def test_samples_are_uniform_over_pixels() -> None:
 
 def test_samples_depend_on_the_generator_alone() -> None:
     dataset, *_ = scattered()
-    first, second, other = (dataset.draw(20, generator("cpu", seed)) for seed in (1, 1, 2))
+    first, second, other = (dataset.sample_pixels(20, generator("cpu", seed)) for seed in (1, 1, 2))
     assert torch.equal(first, second) and not torch.equal(first, other)
 
 
@@ -124,9 +124,9 @@ def test_runs_count_through_the_pixels_that_no_mask_ignores(shares: tuple[float 
     used = (~torch.cat(flat)).nonzero()[:, 0]
     if not len(used):
         with pytest.raises(ValueError, match="the masks ignore every pixel"):
-            dataset.without(ignored)
+            dataset.with_masks(ignored)
         return
-    masked = dataset.without(ignored)
+    masked = dataset.with_masks(ignored)
     assert masked.unmasked_count == len(used)
     if len(used) == 38:
         assert masked is dataset and dataset.runs is None
@@ -139,12 +139,14 @@ def test_ignored_pixels_are_never_drawn_and_the_others_alike() -> None:
     dataset, photos, *_ = scattered()
     ignored = torch.zeros(SIZES[0], dtype=torch.bool)
     ignored[1:, 1:4] = True
-    masked = dataset.without([ignored, torch.ones(SIZES[1], dtype=torch.bool), None])
+    masked = dataset.with_masks([ignored, torch.ones(SIZES[1], dtype=torch.bool), None])
     used = torch.cat([photos[0][~ignored], photos[2].flatten(0, 1)]).float() / 255
-    drawn = masked.lookup(masked.draw(24_000, generator("cpu", 0))).colour  # a thousand for each of the 24 pixels
+    drawn = masked.lookup(
+        masked.sample_pixels(24_000, generator("cpu", 0))
+    ).colour  # a thousand for each of the 24 pixels
     counts = (drawn[:, None] == used).all(-1).sum(0)
     assert len(used) == 24 and counts.sum() == 24_000
-    assert torch.equal(masked.lookup(masked.nth(torch.arange(24))).colour, used)
+    assert torch.equal(masked.lookup(masked.unmasked_pixels(torch.arange(24))).colour, used)
     assert (counts - 1000).abs().max() < 4 * 1000**0.5
 
 
@@ -159,7 +161,7 @@ def test_masks_are_taken_one_by_one_and_dropped() -> None:
         shown.append(weakref.ref(ignored))
         return ignored
 
-    masked, expected = dataset.without(map(mask, SIZES)), dataset.without([mask(size) for size in SIZES])
+    masked, expected = dataset.with_masks(map(mask, SIZES)), dataset.with_masks([mask(size) for size in SIZES])
     assert alive[:3] == [0, 1, 1], "the one before is held until the next is there"
     assert masked.runs is not None and expected.runs is not None and torch.equal(masked.runs, expected.runs)
 
@@ -167,13 +169,16 @@ def test_masks_are_taken_one_by_one_and_dropped() -> None:
 def test_without_masks_the_same_pixels_are_drawn_as_ever() -> None:
     dataset, *_ = scattered()
     pixel = torch.randint(38, (20,), generator=generator("cpu", 3))
-    assert torch.equal(dataset.without([None] * 3).draw(20, generator("cpu", 3)), pixel)
-    assert torch.equal(dataset.nth(pixel), pixel) and dataset.to("cpu").runs is None
+    assert torch.equal(dataset.with_masks([None] * 3).sample_pixels(20, generator("cpu", 3)), pixel)
+    assert torch.equal(dataset.unmasked_pixels(pixel), pixel) and dataset.to("cpu").runs is None
 
 
 def test_pixels_with_depth_are_sampled_as_often() -> None:
     dataset, *_ = scattered()
-    assert dataset.known is None and dataset.with_sparse_depths(torch.zeros(0).long(), torch.zeros(0)).known is None
+    assert (
+        dataset.sparse_pixels is None
+        and dataset.with_sparse_depths(torch.zeros(0).long(), torch.zeros(0)).sparse_pixels is None
+    )
     known = dataset.with_sparse_depths(torch.tensor([3, 30, 3]), torch.tensor([1.5, 4.5, 3.5]))
     pixel, distance = known.sample_sparse_depths(3000, generator("cpu", 0))
     pairs, counts = torch.stack([pixel.float(), distance], 1).unique(dim=0, return_counts=True)
@@ -181,7 +186,7 @@ def test_pixels_with_depth_are_sampled_as_often() -> None:
     assert (counts - 1000).abs().max() < 100
     again, *_ = known.sample_sparse_depths(3000, generator("cpu", 0))
     assert torch.equal(pixel, again)
-    assert torch.equal(known.draw(50, generator("cpu", 1)), dataset.draw(50, generator("cpu", 1)))
+    assert torch.equal(known.sample_pixels(50, generator("cpu", 1)), dataset.sample_pixels(50, generator("cpu", 1)))
 
 
 def test_viewing_distance_is_the_median_of_known_depths() -> None:
@@ -196,10 +201,10 @@ def test_distances_of_pixels_that_masks_ignore_are_forgotten() -> None:
     dataset, *_ = scattered()
     ignored = torch.zeros(SIZES[0], dtype=torch.bool)
     ignored[0] = True
-    masked = dataset.without([ignored, None, None])
-    known = masked.with_sparse_depths(torch.tensor([3, 30]), torch.tensor([1.5, 4.5])).known
+    masked = dataset.with_masks([ignored, None, None])
+    known = masked.with_sparse_depths(torch.tensor([3, 30]), torch.tensor([1.5, 4.5])).sparse_pixels
     assert known is not None and known.tolist() == [30]
-    assert masked.with_sparse_depths(torch.tensor([3]), torch.tensor([1.5])).known is None
+    assert masked.with_sparse_depths(torch.tensor([3]), torch.tensor([1.5])).sparse_pixels is None
 
 
 def test_distances_beyond_near_and_far_are_forgotten() -> None:
@@ -207,7 +212,7 @@ def test_distances_beyond_near_and_far_are_forgotten() -> None:
     rays, _ = dataset.rays(torch.tensor([3]))
     near, far = float(rays.near), float(rays.far)
     distance = torch.tensor([0.9 * near, near, 1.1 * near, 0.9 * far, far, 1.1 * far])
-    known = dataset.with_sparse_depths(torch.full((6,), 3), distance).distance
+    known = dataset.with_sparse_depths(torch.full((6,), 3), distance).sparse_depths
     assert known is not None and known.tolist() == distance[2:4].tolist()
 
 
@@ -215,7 +220,9 @@ def test_distances_of_pixels_that_are_not_opaque_are_forgotten() -> None:
     dataset, *_ = scattered(channels=4)
     pixels = dataset.pixels.clone()
     pixels[3, 3], pixels[4, 3] = 255, 254
-    known = dataset._replace(pixels=pixels).with_sparse_depths(torch.tensor([3, 4]), torch.tensor([1.5, 2.5])).known
+    known = (
+        dataset._replace(pixels=pixels).with_sparse_depths(torch.tensor([3, 4]), torch.tensor([1.5, 2.5])).sparse_pixels
+    )
     assert known is not None and known.tolist() == [3]
 
 
@@ -225,7 +232,7 @@ def test_distances_that_end_outside_of_a_cube_are_forgotten() -> None:
     distance = torch.tensor([1.5, 5.5])
     ends = (rays.origins + distance[:, None] * rays.directions).abs().amax(-1)
     known = dataset.with_sparse_depths(torch.tensor([3, 3]), distance)
-    kept = known.with_sparse_depths_within(float(ends[0]) + 1e-3).distance
+    kept = known.with_sparse_depths_within(float(ends[0]) + 1e-3).sparse_depths
     assert kept is not None and kept.tolist() == [1.5]
-    assert known.with_sparse_depths_within(float(ends[0]) - 1e-3).known is None
+    assert known.with_sparse_depths_within(float(ends[0]) - 1e-3).sparse_pixels is None
     assert dataset.with_sparse_depths_within(1.0) is dataset

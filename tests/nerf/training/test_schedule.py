@@ -4,14 +4,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.training.schedule import CLOSING_SHARE, StepSchedule, learning_rate, replanned, schedule_of, steps_that_fit
+from nerf.training.schedule import (
+    DECAY_START_PROGRESS,
+    StepSchedule,
+    learning_rate,
+    new_schedule,
+    revised_by_clock,
+    steps_that_fit,
+)
 
 
 @st.composite
 def plans(draw: st.DrawFn) -> StepSchedule:
-    plan = schedule_of(draw(st.integers(1, 60)))
+    plan = new_schedule(draw(st.integers(1, 60)))
     for _ in range(draw(st.integers(0, 6))):
-        earliest = plan.decisions[-1].from_step
+        earliest = plan.revisions[-1].from_step
         step = draw(st.integers(earliest, max(earliest, plan.total_steps - 1)))
         plan = plan.revised(step, draw(st.integers(step + 1, step + 60)), plan.progress(step))
     return plan
@@ -27,7 +34,7 @@ def test_share_goes_from_0_to_1_and_never_back(plan: StepSchedule) -> None:
 
 @given(plans(), st.integers(1, 50), st.integers(0, 10**6))
 def test_a_decision_leaves_the_past_and_the_present_alone(plan: StepSchedule, more: int, position: int) -> None:
-    earliest = plan.decisions[-1].from_step
+    earliest = plan.revisions[-1].from_step
     step = earliest + position % (plan.total_steps - earliest)
     revised = plan.revised(step, step + more, plan.progress(step))
     assert [revised.progress(s) for s in range(step + 1)] == [plan.progress(s) for s in range(step + 1)]
@@ -37,96 +44,96 @@ def test_a_decision_leaves_the_past_and_the_present_alone(plan: StepSchedule, mo
 def test_a_schedule_without_later_revisions_is_the_earlier_one(plan: StepSchedule, step: int) -> None:
     earlier = plan.until(step)
     assert [earlier.progress(s) for s in range(step + 1)] == [plan.progress(s) for s in range(step + 1)]
-    assert earlier.decisions[-1].from_step <= step and plan.decisions[: len(earlier.decisions)] == earlier.decisions
+    assert earlier.revisions[-1].from_step <= step and plan.revisions[: len(earlier.revisions)] == earlier.revisions
 
 
 def test_a_plan_without_revision_is_linear() -> None:
-    assert [schedule_of(4).progress(step) for step in range(5)] == [0, 0.25, 0.5, 0.75, 1]
+    assert [new_schedule(4).progress(step) for step in range(5)] == [0, 0.25, 0.5, 0.75, 1]
 
 
 def test_half_way_through_twice_the_steps() -> None:
-    plan = schedule_of(4).revised(2, 6, 0.5)
+    plan = new_schedule(4).revised(2, 6, 0.5)
     assert [plan.progress(step) for step in range(7)] == [0, 0.25, 0.5, 0.625, 0.75, 0.875, 1]
 
 
 @given(plans(), st.integers(1, 60), st.integers(1, 60))
 def test_more_steps_take_progress_back(plan: StepSchedule, more: int, yet_more: int) -> None:
     done = plan.total_steps
-    longer = plan.extended(done + more)
+    longer = plan.extended_to(done + more)
     assert [longer.progress(step) for step in range(done)] == [plan.progress(step) for step in range(done)]
-    whole = schedule_of(done + more)
+    whole = new_schedule(done + more)
     for step in range(done, done + more + 1):
         assert longer.progress(step) == pytest.approx(whole.progress(step), abs=1e-12)
-    assert longer.extended(done + more + yet_more).progress(done + more) == (done + more) / (done + more + yet_more)
-    assert plan.is_whole and not longer.is_whole
+    assert longer.extended_to(done + more + yet_more).progress(done + more) == (done + more) / (done + more + yet_more)
+    assert plan.is_single_cycle and not longer.is_single_cycle
 
 
 @given(st.integers(1, 500), st.data())
 def test_a_run_that_closes_early_ends_as_every_run_does(total: int, data: st.DataObject) -> None:
-    plan, step = schedule_of(total), data.draw(st.integers(0, total - 1))
-    closed = plan.closing(step)
+    plan, step = new_schedule(total), data.draw(st.integers(0, total - 1))
+    closed = plan.with_decay_from(step)
     assert step < closed.total_steps <= total
-    assert closed.progress(step) >= CLOSING_SHARE and closed.progress(closed.total_steps) == 1
+    assert closed.progress(step) >= DECAY_START_PROGRESS and closed.progress(closed.total_steps) == 1
     assert [closed.progress(s) for s in range(step)] == [plan.progress(s) for s in range(step)]
     if closed.total_steps < total and step >= 10:
-        whole = schedule_of(closed.total_steps)
+        whole = new_schedule(closed.total_steps)
         assert closed.progress(step) == pytest.approx(whole.progress(step), abs=0.05)
 
 
 def test_a_run_may_end_at_any_step() -> None:
-    ended = schedule_of(10).closing(6).ended(7)
-    assert ended.total_steps == 7 and ended.progress(7) == schedule_of(10).closing(6).progress(7)
+    ended_at = new_schedule(10).with_decay_from(6).ended_at(7)
+    assert ended_at.total_steps == 7 and ended_at.progress(7) == new_schedule(10).with_decay_from(6).progress(7)
     with pytest.raises(ValueError, match="cannot end"):
-        ended.ended(7)
-    with pytest.raises(ValueError, match="cannot close"):
-        ended.closing(7)
+        ended_at.ended_at(7)
+    with pytest.raises(ValueError, match="cannot decay"):
+        ended_at.with_decay_from(7)
 
 
 @pytest.mark.parametrize("total", [4, 3])
 def test_more_steps_are_more_than_there_were(total: int) -> None:
-    with pytest.raises(ValueError, match="cannot go on"):
-        schedule_of(4).extended(total)
+    with pytest.raises(ValueError, match="cannot be extended"):
+        new_schedule(4).extended_to(total)
 
 
 @pytest.mark.parametrize(("step", "total"), [(5, 5), (3, 9)])
 def test_no_decision_without_a_step_left_or_about_the_past(step: int, total: int) -> None:
     with pytest.raises(ValueError, match="cannot become"):
-        schedule_of(10).revised(4, 8, 0.4).revised(step, total, 0.5)
+        new_schedule(10).revised(4, 8, 0.4).revised(step, total, 0.5)
 
 
 def test_a_run_has_steps() -> None:
     with pytest.raises(ValueError, match="at least one step"):
-        schedule_of(0)
+        new_schedule(0)
 
 
 @given(st.floats(0.01, 1000), st.floats(0.01, 1000))
 def test_a_run_on_a_steady_clock_ends_on_time(budget: float, rate: float) -> None:
-    plan, step = schedule_of(10**6), 0
+    plan, step = new_schedule(10**6), 0
     while step < plan.total_steps and step < 40:
         step += 1
         if step < plan.total_steps:
-            plan = replanned(plan, step, step / rate, budget, rate, 0.01 * budget)
+            plan = revised_by_clock(plan, step, step / rate, budget, rate, 0.01 * budget)
     # The first step is what the clock is read by, and one more is the least a plan can hold.
     assert abs(plan.total_steps / rate - budget) <= 0.01 * budget + 2 / rate
-    assert len(plan.decisions) <= 2
+    assert len(plan.revisions) <= 2
 
 
 def test_a_slow_run_is_cut_short_and_ends_at_1() -> None:
-    plan = replanned(schedule_of(100), 50, 9.0, 10.0, 10.0, 0.1)
+    plan = revised_by_clock(new_schedule(100), 50, 9.0, 10.0, 10.0, 0.1)
     assert plan.total_steps == 60
     assert plan.progress(49) == 0.49 and plan.progress(50) == 0.9
     assert plan.progress(60) == pytest.approx(1)
 
 
 def test_a_schedule_made_too_short_leaves_no_trace() -> None:
-    plan = replanned(schedule_of(30), 29, 1.5, 30.0, 20.0, 0.3)
+    plan = revised_by_clock(new_schedule(30), 29, 1.5, 30.0, 20.0, 0.3)
     assert plan.total_steps == 29 + 570
     assert plan.progress(29) == 0.05
 
 
 def test_a_plan_that_is_right_enough_stands() -> None:
-    plan = schedule_of(100)
-    assert replanned(plan, 50, 4.95, 10.0, 10.0, 0.1) is plan
+    plan = new_schedule(100)
+    assert revised_by_clock(plan, 50, 4.95, 10.0, 10.0, 0.1) is plan
 
 
 def test_past_the_deadline_one_step_is_left() -> None:

@@ -10,16 +10,18 @@ from nerf.effects.exposure import ExposureModel
 from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
+from nerf.training.evaluation_pixels import evaluate, sample_evaluation_pixels
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
-from nerf.training.trainer import NonFinite, over
-from nerf.training.validation_probe import make_probe, measure
+from nerf.training.trainer import NonFinite, composite_over
 from nerf.training.vanilla_trainer import VanillaTrainer, VanillaTrainerSettings
 from tests.nerf.training.test_hash_grid_trainer import copied, same
 
 FIELD = VanillaSettings(
     depth=2, width=16, skip=9, position_frequencies=3, direction_frequencies=1, samples_coarse=8, samples_fine=8
 )
-TRAINER = VanillaTrainerSettings(batch_rays=64, seed=3, background=(1.0, 1.0, 1.0), rate_start=5e-3, rate_end=5e-4)
+TRAINER = VanillaTrainerSettings(
+    batch_rays=64, seed=3, background=(1.0, 1.0, 1.0), initial_learning_rate=5e-3, final_learning_rate=5e-4
+)
 
 
 def small_dataset(channels: int = 3, size: int = 12) -> RayDataset:
@@ -74,11 +76,11 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 def test_training_beats_a_flat_colour() -> None:
     dataset = small_dataset()
     run = trainer(dataset=dataset)
-    probe = make_probe(dataset, 288, torch.ones(3), seed=5)
-    assert measure(run.model, probe).psnr < probe.mean_colour_psnr + 2
+    probe = sample_evaluation_pixels(dataset, 288, torch.ones(3), seed=5)
+    assert evaluate(run.model, probe).psnr < probe.mean_colour_psnr + 2
     for step in range(150):
         run.step(step, step / 150)
-    assert probe.mean_colour_psnr + 3 < measure(run.model, probe).psnr < 60
+    assert probe.mean_colour_psnr + 3 < evaluate(run.model, probe).psnr < 60
 
 
 def test_the_loss_sums_both_renderings_errors() -> None:
@@ -89,7 +91,7 @@ def test_the_loss_sums_both_renderings_errors() -> None:
     assert alone.loss == pytest.approx(10 ** (-alone.psnr / 10), rel=1e-5)
     assert both.loss > 1.2 * 10 ** (-both.psnr / 10)
     assert both.rays == TRAINER.batch_rays
-    assert both.samples == both.densities == both.rays * FIELD.queries_per_ray
+    assert both.colour_evaluations == both.density_evaluations == both.rays * FIELD.queries_per_ray
 
 
 @pytest.mark.parametrize(("broken", "quantity"), [("loss", "loss"), ("gradient", "gradient")])
@@ -139,7 +141,7 @@ def test_a_random_background_is_new_each_step() -> None:
 
 def test_steps_draw_every_pixel_once_before_any_again(monkeypatch: pytest.MonkeyPatch) -> None:
     run, drawn = trainer(dataset=small_dataset(size=16)), list[Tensor]()
-    monkeypatch.setattr(RayDataset, "nth", lambda _, numbers: drawn.append(numbers) or numbers)
+    monkeypatch.setattr(RayDataset, "unmasked_pixels", lambda _, numbers: drawn.append(numbers) or numbers)
     for step in range(12):
         run.step(step, 0.0)
     often = torch.cat(drawn).bincount(minlength=512)
@@ -148,10 +150,12 @@ def test_steps_draw_every_pixel_once_before_any_again(monkeypatch: pytest.Monkey
 
 def test_over_is_linear_between_background_and_colour() -> None:
     colour, background = torch.tensor([[0.2, 0.4, 0.6]]), torch.tensor([1.0, 0.0, 0.5])
-    assert torch.equal(over(colour, None, background), colour)
-    torch.testing.assert_close(over(colour, torch.zeros(1), background)[0], background)
-    torch.testing.assert_close(over(colour, torch.ones(1), background), colour)
-    torch.testing.assert_close(over(colour, torch.tensor([0.25]), background)[0], torch.tensor([0.8, 0.1, 0.525]))
+    assert torch.equal(composite_over(colour, None, background), colour)
+    torch.testing.assert_close(composite_over(colour, torch.zeros(1), background)[0], background)
+    torch.testing.assert_close(composite_over(colour, torch.ones(1), background), colour)
+    torch.testing.assert_close(
+        composite_over(colour, torch.tensor([0.25]), background)[0], torch.tensor([0.8, 0.1, 0.525])
+    )
 
 
 def test_a_state_of_another_architecture_is_refused() -> None:

@@ -50,9 +50,12 @@ def test_help_of_run_lists_the_stage_options(capsys: pytest.CaptureFixture[str])
         (["--until", "lunch"], "--until lunch: not one of ingest, sfm"),
         (["--until", "sfm", "--from", "mesh"], "--from mesh: not one of ingest, sfm"),
         (["--config", "missing.toml"], "--config missing.toml: No such file"),
-        (["--train.steps", "0", "--train.log2-rows", "99"], "--train.steps 0 must be at least 1; "
-         "--train.log2-rows 99 must be at most 24 (pipeline run --help)"),
-        (["--train.steps", "5", "--train.seconds", "5"], "--train: steps (5) and seconds (5) are two budgets"),
+        (["--train.steps", "0", "--train.downscale", "0.5"], "--train.steps 0 must be at least 1; "
+         "--train.downscale 0.5 must be at least 1 (pipeline run --help)"),
+        (["--train.grid.max-res", "9"], "--train.grid.max-res 9 must be at least 16 (pipeline run --help)"),
+        (["--train.grid.max-res", "64", "--train.field", "vanilla"],
+         "--train.grid.max-res has no effect with --train.field vanilla; leave out one of the two"),
+        (["--train.steps", "5", "--train.seconds", "5"], "--train.steps 5 and --train.seconds 5 are two budgets"),
         (["--train.steps", "many"], "--train.steps: 'many' does not fit {None}|INT (pipeline run --help)"),
         (["--train.field", "foo"], "invalid choice 'foo' for argument '--train.field'. Expected one of ("),
         (["--target-psnr", "0"], "--train.target-psnr 0.0 must be greater than 0 (pipeline run --help)"),

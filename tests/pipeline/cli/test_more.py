@@ -9,7 +9,10 @@ from nerf.training.hash_grid_trainer import HashGridTrainer
 from pipeline.cli.commands import run_command
 from tests.small_scenes import write_blender_scene
 
-SMALL = "--train.levels 2 --train.log2-rows 8 --train.finest 16 --train.batch-samples 512 --train.chunks 1".split()
+SMALL = (
+    "--train.grid.num-levels 2 --train.grid.log2-hashmap-size 8 --train.grid.max-res 16"
+    " --train.grid.target-samples 512 --train.grid.micro-batches 1"
+).split()
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +47,10 @@ def test_more_chains_folders_of_its_own(trained, monkeypatch: pytest.MonkeyPatch
     assert (first / "manifest.json").read_bytes() == before, "the first stays as it was"
     linked = (Path(workspace) / "output" / "curve.json").resolve()
     assert linked == (second / "curve.json").resolve()
-    assert [json.loads((folder / "curve.json").read_text())["whole"] for folder in (first, second)] == [True, False]
+    assert [json.loads((folder / "curve.json").read_text())["single_cycle"] for folder in (first, second)] == [
+        True,
+        False,
+    ]
 
     moved = Path(workspace).rename(Path(workspace).with_name("moved.nerf"))
     try:

@@ -69,8 +69,16 @@ def test_the_budget_given_replaces_the_one_remembered(words: list[str], budget: 
 @pytest.mark.parametrize(
     ("remembered", "words", "left"),
     [
-        ({"preset": "paper", "width": 64, "seed": 3}, ["--train.field", "grid"], {"field": "grid", "seed": 3}),
-        ({"levels": 3, "preset": "draft"}, ["--train.field=paper"], {"field": "paper", "preset": "draft"}),
+        (
+            {"preset": "paper", "vanilla": {"width": 64}, "seed": 3},
+            ["--train.field", "grid"],
+            {"field": "grid", "seed": 3},
+        ),
+        (
+            {"grid": {"num_levels": 3}, "preset": "draft"},
+            ["--train.field=vanilla"],
+            {"field": "vanilla", "preset": "draft"},
+        ),
     ],
 )
 def test_the_field_given_takes_back_the_options_of_the_other(remembered: dict, words: list[str], left: dict):
@@ -171,8 +179,10 @@ def test_poses_no_field_can_fit_are_refused_first(tmp_path: Path, capsys: pytest
     (tmp_path / "photos").mkdir()
     Image.new("RGB", (40, 30)).save(tmp_path / "photos/a.jpg")
     words = ["run", str(tmp_path / "photos"), "-o", str(tmp_path / "w"), "--evaluate.fit-poses", "on"]
-    for asks_for_paper in (["--train.field", "paper"], ["--train.preset", "paper"], ["--train.width", "64"]):
-        assert run_command([*words, *asks_for_paper]) == 2
+    for vanilla in (["--train.field", "vanilla"], ["--train.preset", "paper"], ["--train.vanilla.width", "64"]):
+        assert run_command([*words, *vanilla]) == 2
         assert "give --evaluate.fit-poses auto" in capsys.readouterr().err
     assert not (tmp_path / "w").exists()
-    assert run_command([*words, "--train.width", "64", "--until", "ingest"]) == 10, "a single photo: that is said first"
+    assert run_command([*words, "--train.vanilla.width", "64", "--until", "ingest"]) == 10, (
+        "a single photo: that is said first"
+    )

@@ -10,7 +10,7 @@ from nerf.training.hash_grid_trainer import ADAM_BYTES
 from pipeline import doctor
 from pipeline.cli import commands
 from pipeline.doctor import bench
-from stages.train.fields.hash_grid import PART_SAMPLES, SAMPLES_PER_RAY
+from stages.train.fields.hash_grid import MICRO_BATCH_SAMPLES, SAMPLES_PER_RAY
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def test_every_rate_has_a_line_with_figures_of_a_computer(quick: None, capsys: p
     for space, where in bench.WHERE.items():
         (name,) = (name for _, name in reached if where in name)
         assert f"({SAMPLES_PER_RAY[space]} colours, {bench.DENSITIES[space]} densities a ray)" in name
-    assert len(reached) == len(bench.WHERE) + len(bench.PAPER_RAYS)
+    assert len(reached) == len(bench.WHERE) + len(bench.VANILLA_RAYS)
     assert all(float(speed.rstrip("kM ")) > 0 for speed, _ in reached)
 
 
@@ -52,5 +52,5 @@ def test_the_optimisers_share_follows_the_rays_per_step(space: str, monkeypatch:
     one, four = works
     assert one.streamed_bytes == pytest.approx(4 * four.streamed_bytes)
     assert (one.matmul_flops, one.gathered_rows) == (four.matmul_flops, four.gathered_rows)
-    entries = one.streamed_bytes / ADAM_BYTES * PART_SAMPLES[space] / SAMPLES_PER_RAY[space]
+    entries = one.streamed_bytes / ADAM_BYTES * MICRO_BATCH_SAMPLES[space] / SAMPLES_PER_RAY[space]
     assert 3 * 2**18 < entries / 4 <= 5 * 2**18, "five grids of four features, the coarse ones small"

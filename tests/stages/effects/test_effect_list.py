@@ -17,8 +17,9 @@ from stages.effects.image_effects import photo_effects
 from stages.io.field_files import load_field
 from stages.io.files import read_json, read_scene
 from stages.render.renderer import load_renderer
-from stages.render.video import as_asked
+from stages.render.video import with_appearance
 from stages.report.effects import effects_table
+from stages.train.fields.hash_grid_options import HashGridOptions
 from tests.effect_scenes import Effects, effect_scene
 from tests.nerf.effects import veil
 from tests.nerf.effects.veil import VeilModel
@@ -43,8 +44,8 @@ def trained(listed: None, tmp_path: Path) -> dict[str, Path]:
         inputs[name].mkdir()
     decide = with_effects(Settings(), ["veil=on", "exposure=on"]).effects.model_copy(update={"pilots": 0})
     effects.run(decide, inputs, inputs["effects"], Quiet())
-    sizes: dict[str, Any] = {"levels": 2, "log2_rows": 8, "finest": 16, "batch_samples": 512}
-    train.run(train.Config(downscale=8.0, steps=5, **sizes), inputs, inputs["train"], Quiet())
+    grid = HashGridOptions(num_levels=2, log2_hashmap_size=8, max_res=16, target_samples=512)
+    train.run(train.Config(downscale=8.0, steps=5, grid=grid), inputs, inputs["train"], Quiet())
     return inputs
 
 
@@ -90,7 +91,7 @@ def test_photos_are_rendered_and_scored_through_a_new_effect(trained: dict[str, 
     like = scene.of_split("train")[3].name
     rendered = render.run(render.Config(frames=2, width=32, match_exposure=like), trained, trained["render"], Quiet())
     assert rendered.facts["appearance"] == f"exposed like {like}"
-    as_photo, _ = as_asked(load_renderer(trained["train"]), like, trained["train"], scene, Quiet())
+    as_photo, _ = with_appearance(load_renderer(trained["train"]), like, trained["train"], scene, Quiet())
     assert isinstance(as_photo.model, AppearanceModel)
     assert torch.equal(as_photo.model.effects[1].rows, torch.tensor([[0.25]]))
 

@@ -55,11 +55,11 @@ def test_fitted_poses_are_scored_at_the_photos_exposure(tmp_path: Path, monkeypa
     scored = scoring.score(scorer, tmp_path, Quiet()).images[0]
     rays = view_rays(scene, view, 1.0)
     exposed = neutral.through(photo_effects(info, scene, view))
-    assert given[0][0] is field and torch.equal(given[0][1], exposed.draw(rays).colour)
+    assert given[0][0] is field and torch.equal(given[0][1], exposed.render(rays).colour)
     assert [effect.rows.tolist() for effect in given[0][2]] == [[pytest.approx([0.7] * 3)]]
     truth = PhotoReader(inputs["ingest"], scene, 1.0).pixels(view, (0.0,) * 3)
-    right, fitted = right_half_psnr(exposed.draw(rays), torch.zeros(3), truth)
-    _, posed = right_half_psnr(exposed.draw(rays._replace(near=rays.near + 0.5)), torch.zeros(3), truth)
+    right, fitted = right_half_psnr(exposed.render(rays), torch.zeros(3), truth)
+    _, posed = right_half_psnr(exposed.render(rays._replace(near=rays.near + 0.5)), torch.zeros(3), truth)
     assert scored["psnr_right_half"] == pytest.approx(right) and scored["psnr_exposure_fitted"] == pytest.approx(fitted)
     assert scored["psnr_pose_fitted"] == pytest.approx(posed)
 

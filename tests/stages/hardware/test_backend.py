@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
@@ -17,11 +17,12 @@ from stages.contract import StageConfig, StageError
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.io.field_files import load_field
 from stages.train import Config
+from stages.train.fields.hash_grid_options import HashGridOptions
 from tests.refusals import refused
 from tests.stages.photo_scene import photographed
 
 ROOT = Path(__file__).parents[3]
-TINY: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024, "downscale": 1.0}
+TINY: dict[str, Any] = {"num_levels": 2, "log2_hashmap_size": 10, "max_res": 32, "target_samples": 1024}
 OLD_DRIVER = "Warp 1.19.0 finds no CUDA driver that is new enough for it"
 NOTE = "the hash-grid field is computed by torch alone, several times slower: "
 AS_TRAINED = "the hash-grid field is computed by torch alone, as it was trained: several times slower than by Warp"
@@ -30,7 +31,7 @@ AS_TRAINED = "the hash-grid field is computed by torch alone, as it was trained:
 @pytest.fixture
 def useless(monkeypatch: pytest.MonkeyPatch) -> None:
     """Warp loads, but its kernels do not run."""
-    monkeypatch.setattr(warp, "why_not", lambda device: OLD_DRIVER)
+    monkeypatch.setattr(warp, "unavailable_reason", lambda device: OLD_DRIVER)
 
 
 @pytest.fixture
@@ -68,17 +69,17 @@ def test_where_kernels_cannot_be_kept_the_way_out_is_named(tmp_path: Path, monke
         raise OSError(errno.ENOSPC, "No space left on device", "/home/.cache")
 
     monkeypatch.setattr(warp, "compile_kernels", full)
-    with refused("hardware.kernel-cache", "WARP_CACHE_PATH", "--train.backend torch"):
+    with refused("hardware.kernel-cache", "WARP_CACHE_PATH", "--train.grid.backend torch"):
         load_backend("warp", "cpu")
 
 
 def test_why_not_says_what_is_wrong_with_a_gpu_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("warp.is_cuda_available", lambda: False)
-    assert warp.why_not("cpu") is None
-    why = warp.why_not("cuda")
+    assert warp.unavailable_reason("cpu") is None
+    why = warp.unavailable_reason("cuda")
     assert why and why.startswith("Warp 1.") and why.endswith(" finds no CUDA driver that is new enough for it")
     monkeypatch.setattr("warp.is_cuda_available", lambda: True)
-    assert warp.why_not("cuda") is None
+    assert warp.unavailable_reason("cuda") is None
 
 
 def test_a_backend_is_loaded_by_name(progress) -> None:
@@ -97,7 +98,7 @@ def test_warp_asked_for_by_name_is_not_replaced_silently(
         load_backend("warp", "cuda")
     assert refused.value.what == "cannot use the Warp kernels"
     assert refused.value.why.startswith(why)
-    assert refused.value.hint == "Use --train.backend torch."
+    assert refused.value.hint == "Use --train.grid.backend torch."
 
 
 def test_loading_warp_says_nothing_and_leaves_stderr_open() -> None:
@@ -109,15 +110,19 @@ def test_loading_warp_says_nothing_and_leaves_stderr_open() -> None:
     assert (answer.returncode, answer.stdout, answer.stderr) == (0, "warp\n", "heard\n")
 
 
+def tiny(backend: Literal["torch", "warp"] | None = None, **settings: Any) -> Config:
+    return Config(downscale=1.0, grid=HashGridOptions(**TINY, backend=backend), **settings)
+
+
 def test_planning_chooses_and_keeps_a_backend(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs, _ = photographed(tmp_path)
-    sized = Config(**TINY, steps=10)
-    assert train.plan(sized, inputs, progress).backend == "warp"
-    monkeypatch.setattr(warp, "why_not", lambda device: OLD_DRIVER)
-    assert train.plan(sized, inputs, progress).backend == "torch"
+    sized = tiny(steps=10)
+    assert train.plan(sized, inputs, progress).grid.backend == "warp"
+    monkeypatch.setattr(warp, "unavailable_reason", lambda device: OLD_DRIVER)
+    assert train.plan(sized, inputs, progress).grid.backend == "torch"
     assert progress.notes == [NOTE + OLD_DRIVER]
-    with refused("hardware.no-warp", "--train.backend torch"):
-        train.plan(Config(**TINY, steps=10, backend="warp"), inputs, progress)
+    with refused("hardware.no-warp", "--train.grid.backend torch"):
+        train.plan(tiny("warp", steps=10), inputs, progress)
 
 
 def test_both_backends_train_the_same_field_from_photos(tmp_path: Path, progress) -> None:
@@ -125,10 +130,11 @@ def test_both_backends_train_the_same_field_from_photos(tmp_path: Path, progress
     themselves 0.3 dB."""
     inputs, _ = photographed(tmp_path, channels=4)
     found = {}
-    for backend in ("warp", "torch"):
+    backends: tuple[Literal["torch", "warp"], ...] = ("warp", "torch")
+    for backend in backends:
         folder = tmp_path / backend
         folder.mkdir()
-        result = train.run(Config(**TINY, backend=backend, steps=120), inputs, folder, progress)
+        result = train.run(tiny(backend, steps=120), inputs, folder, progress)
         found[backend] = result.facts["probe_psnr"]
         assert load_field(folder)[1]["kind"] == "grid"
     flat = 11.0  # dB, of the best single colour
@@ -148,7 +154,7 @@ def test_what_torch_trained_stays_with_torch_in_every_stage(stage: ModuleType, t
     inputs, _ = photographed(tmp_path, channels=4)
     for name in ("train", "later"):
         (tmp_path / name).mkdir()
-    train.run(Config(**TINY, backend="torch", steps=2), inputs, tmp_path / "train", progress)
+    train.run(tiny("torch", steps=2), inputs, tmp_path / "train", progress)
     assert AS_TRAINED not in progress.notes
     with contextlib.suppress(StageError):  # two steps may leave no surface
         stage.run(LATER[stage], inputs | {"train": tmp_path / "train"}, tmp_path / "later", progress)

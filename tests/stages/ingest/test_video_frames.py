@@ -1,5 +1,6 @@
 """Which frames of a video are taken, and what is said where there are none."""
 
+import shlex
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from stages.contract import StageError
+from stages.ingest import video_frames
 from stages.ingest.video_frames import (
     LONG_STEP,
     LOST,
@@ -123,6 +125,100 @@ def test_a_turned_video_stands_upright(turn: int, quarters: int, tmp_path: Path,
     first, expected = np.asarray(Image.open(frames[0].file)).astype(int), np.rot90(pictures[0], quarters)
     assert (frames[0].height, frames[0].width) == expected.shape[:2]
     assert np.abs(first - expected).mean() < 12
+
+
+FFMPEG = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error"]
+BT2020_FROM_BT709 = np.array([[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]])
+
+
+def hlg(nits: np.ndarray) -> np.ndarray:
+    """The HLG signal of linear BT.2020 light on a display of 1000 cd/m² (ITU-R BT.2100)."""
+    light = nits / 1000
+    luminance = np.maximum(light @ [0.2627, 0.6780, 0.0593], 1e-6)
+    scene = light * (luminance ** (-0.2 / 1.2))[..., None]
+    above = 0.17883277 * np.log(np.maximum(12 * scene - 0.28466892, 1e-9)) + 0.55991073
+    return np.where(scene <= 1 / 12, np.sqrt(3 * scene), above)
+
+
+def pq(nits: np.ndarray) -> np.ndarray:
+    """The PQ signal (SMPTE ST 2084)."""
+    power = (nits / 10000) ** 0.1593017578125
+    return ((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power)) ** 78.84375
+
+
+def hdr_clip(path: Path, pictures: list[np.ndarray], transfer: str) -> Path:
+    """sRGB pictures, white at 203 cd/m², as 10-bit HEVC of BT.2020 primaries."""
+    for number, picture in enumerate(pictures):
+        encoded = picture / 255
+        light = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+        signal = {"arib-std-b67": hlg, "smpte2084": pq}[transfer](203 * np.clip(light @ BT2020_FROM_BT709.T, 0, None))
+        cv2.imwrite(str(path.parent / f"hdr{number}.png"), np.rint(65535 * signal).astype(np.uint16)[..., ::-1])
+    colours = f"colorprim=bt2020:transfer={transfer}:colormatrix=bt2020nc"
+    words = ["-framerate", str(FPS), "-i", str(path.parent / "hdr%d.png")]
+    words += ["-vf", "scale=out_color_matrix=bt2020:out_range=tv,format=yuv420p10le", "-c:v", "libx265", "-crf", "4"]
+    words += ["-x265-params", f"log-level=error:{colours}", "-color_primaries", "bt2020", "-color_trc", transfer]
+    subprocess.run([*FFMPEG, *words, "-colorspace", "bt2020nc", str(path)], check=True)
+    return path
+
+
+def coloured(pictures: list[np.ndarray]) -> list[np.ndarray]:
+    """With a colour of its own for each third of the picture, none as light as white."""
+    tint = np.repeat([[0.8, 0.5, 0.4], [0.4, 0.8, 0.5], [0.75, 0.75, 0.75]], WIDTH // 3 + 1, axis=0)[:WIDTH]
+    return [np.rint(picture * tint).astype(np.uint8) for picture in pictures]
+
+
+@pytest.mark.parametrize(("transfer", "name"), [("arib-std-b67", "HLG"), ("smpte2084", "PQ")])
+def test_hdr_video_is_tone_mapped_to_srgb(
+    transfer: str, name: str, tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pictures = coloured(panned(*np.arange(6) / 6))
+    path = hdr_clip(tmp_path / "a.mov", pictures, transfer)
+
+    def off(folder: str) -> float:
+        frames = taken(path, tmp_path / folder, progress)
+        assert [frame.number for frame in frames] == list(range(6))
+        shown = (np.asarray(Image.open(frame.file)).astype(int) for frame in frames)
+        return max(float(np.abs(one - other).mean()) for one, other in zip(shown, pictures, strict=True))
+
+    assert off("mapped") < 6, "as near as JPEG and chroma of half the size allow"
+    assert progress.notes[0] == f"a.mov is HDR video ({name}): its frames are tone-mapped to sRGB, white at 203 cd/m²"
+    monkeypatch.setattr(video_frames, "can_tone_map", lambda: False)
+    progress.notes.clear()
+    assert off("flat") > 9
+    command = progress.notes[0].split("has them: ")[1]
+    assert command.startswith('ffmpeg -i a.mov -vf "zscale=') and f"a.mov is HDR video ({name}), " in progress.notes[0]
+    words = [*FFMPEG, *shlex.split(command)[1:]]  # the command does it
+    subprocess.run(words, cwd=tmp_path, check=True)
+    path = tmp_path / "sdr.mp4"
+    assert off("converted") < 8 and not any("HDR" in note for note in progress.notes[1:])
+
+
+def test_turned_hdr_video_stands_upright(tmp_path: Path, progress: Any) -> None:
+    pictures = coloured(panned(*np.arange(6) / 6))
+    stored, turned = hdr_clip(tmp_path / "a.mov", pictures, "arib-std-b67"), tmp_path / "b.mov"
+    words = [*FFMPEG, "-display_rotation", "90", "-i", str(stored), "-c", "copy", str(turned)]
+    subprocess.run(words, check=True)
+    frames = taken(turned, tmp_path / "out", progress)
+    shown, expected = np.asarray(Image.open(frames[0].file)).astype(int), np.rot90(pictures[0])
+    assert shown.shape == expected.shape and np.abs(shown - expected).mean() < 6
+
+
+def test_an_hdr_frame_that_cannot_be_read_again_is_named(tmp_path: Path) -> None:
+    path = hdr_clip(tmp_path / "a.mov", panned(*np.arange(4) / 6), "smpte2084")
+    with pytest.raises(StageError) as caught:
+        list(video_frames._tone_mapped(path, [1, 7], "smpte2084"))
+    assert caught.value.code == "ingest.frame-lost" and "frame 7" in caught.value.why
+
+
+def test_times_of_a_variable_frame_rate_are_right(tmp_path: Path, progress: Any) -> None:
+    steady, uneven = clip(tmp_path / "a.mp4", panned(*np.arange(12) / 12)), tmp_path / "b.mp4"
+    words = ["-i", str(steady), "-vf", "settb=1/9000,setpts='(N+0.35*mod(N,3)+2*gte(N,6))/10/TB'"]
+    words += ["-fps_mode", "passthrough", "-enc_time_base", "1:9000", "-video_track_timescale", "9000"]
+    subprocess.run([*FFMPEG, *words, str(uneven)], check=True)
+    frames = taken(uneven, tmp_path / "out", progress)
+    assert [frame.number for frame in frames] == list(range(12))
+    expected = [(n + 0.35 * (n % 3) + 2 * (n >= 6)) / 10 for n in range(12)]
+    assert [frame.time_s for frame in frames] == pytest.approx(expected, abs=0.002)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ GRID = HashGridSettings(
 KERNELS = load_backend(chosen_backend("cpu"), "cpu")
 OUTDOORS = HashGridField(replace(GRID, background_model=True), 5, KERNELS)
 OUTDOORS.background_table.normal_(generator=torch.Generator().manual_seed(6))
-KINDS = {"paper": VanillaNerf(SMALL, seed=5), "grid": HashGridField(GRID, 5, KERNELS), "sky": OUTDOORS}
+KINDS = {"vanilla": VanillaNerf(SMALL, seed=5), "grid": HashGridField(GRID, 5, KERNELS), "sky": OUTDOORS}
 BY_TORCH = "the hash-grid field is computed by torch alone, as it was trained"
 INFO = {"background": [1.0, 1.0, 1.0], "downscale": 2.5, "steps": 7, "rays": 700, "effects": {}}
 
@@ -40,14 +40,14 @@ def test_a_field_comes_back_the_same(kind: str, tmp_path: Path) -> None:
         assert all(torch.equal(*pair) for pair in zip(seen, loaded.render(rays, torch.ones(3)), strict=True))
     assert seen.opacity.min() > 0 and seen.colour.std() > 0
     assert {key: info[key] for key in INFO} == INFO
-    assert info["kind"] == ("paper" if kind == "paper" else "grid")
+    assert info["kind"] == ("vanilla" if kind == "vanilla" else "grid")
     assert info["settings"]["space"] == {"kind": "contraction"}
 
 
 def test_files_are_read_from_folders_whose_names_are_not_unicode(tmp_path: Path) -> None:
     folder = tmp_path / "caf\udce9"
     folder.mkdir()
-    save_field(folder, KINDS["paper"], INFO)
+    save_field(folder, KINDS["vanilla"], INFO)
     assert load_field(folder)[1]["steps"] == 7
     write_tensors(folder / "points.safetensors", {"none": np.zeros((0, 3))})
     assert read_tensors(folder / "points.safetensors")["none"].shape == (0, 3)
@@ -112,7 +112,7 @@ def test_a_field_with_exposure_is_shown_at_the_reference(kind: str, tmp_path: Pa
 
 
 def test_a_field_without_exposure_is_the_field_itself(tmp_path: Path) -> None:
-    save_field(tmp_path, KINDS["paper"], INFO)
+    save_field(tmp_path, KINDS["vanilla"], INFO)
     loaded, _ = load_field(tmp_path)
     assert isinstance(loaded, VanillaNerf)
 
@@ -131,7 +131,7 @@ def test_a_field_without_exposure_is_the_field_itself(tmp_path: Path) -> None:
     ],
 )
 def test_damaged_effects_are_refused_in_words(harm: object, tmp_path: Path) -> None:
-    save_field(tmp_path, KINDS["paper"], INFO | {"effects": harm})
+    save_field(tmp_path, KINDS["vanilla"], INFO | {"effects": harm})
     with refused("io.field-weights"):
         load_field(tmp_path)
 

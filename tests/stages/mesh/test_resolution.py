@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf import REGION_HALF
+from nerf import REGION_HALF_SIZE
 from stages.mesh.resolution import (
     FIXED_COST,
     MARGIN,
@@ -21,7 +21,7 @@ from stages.mesh.resolution import (
     slab_factor,
 )
 
-CUBE = np.array([[-REGION_HALF] * 3, [REGION_HALF] * 3])
+CUBE = np.array([[-REGION_HALF_SIZE] * 3, [REGION_HALF_SIZE] * 3])
 GROUND = np.random.default_rng(0).uniform([-0.8, -0.8, -0.3], [0.8, 0.8, -0.1], (2000, 3))
 FACADE = GROUND[:, [0, 2, 1]] * [1, 1, 0.2]
 
@@ -63,7 +63,7 @@ def test_the_yardstick_is_the_best_of_a_few(monkeypatch: pytest.MonkeyPatch):
 def test_a_flat_scenes_grid_spans_its_slice(points, flat, capture_type):
     stray = np.array([[0.1, 0.1, 0.85], [0.5, 0.85, 0.1], [0.0, 0.0, 30.0]])
     box = grid_box(capture_type, np.concatenate([points, stray]))
-    ends = np.quantile(points[:, flat], [0, 1]) + np.array([-1, 1]) * 2 * REGION_HALF * MARGIN
+    ends = np.quantile(points[:, flat], [0, 1]) + np.array([-1, 1]) * 2 * REGION_HALF_SIZE * MARGIN
     np.testing.assert_allclose(box[:, flat], ends, atol=0.02)
     rest = [axis for axis in range(3) if axis != flat]
     np.testing.assert_array_equal(box[:, rest], CUBE[:, rest])

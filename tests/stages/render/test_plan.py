@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from nerf.geometry.scene import Camera
 from stages import render
 from stages.render.path import even_height
-from stages.render.plan import affordable, chosen_fps, longest_side
+from stages.render.plan import choose_frames_and_width, default_fps, max_useful_side
 
 LANDSCAPE = Camera("PINHOLE", 1600, 1000, (1500.0, 1500.0, 800.0, 500.0))
 PORTRAIT = Camera("PINHOLE", 1000, 1600, (1500.0, 1500.0, 500.0, 800.0))
@@ -23,7 +23,7 @@ def pixels(frames: int, width: int, camera: Camera) -> int:
 
 @given(st.floats(1, 1e10), st.sampled_from([LANDSCAPE, PORTRAIT]), SIDES)
 def test_a_video_keeps_to_its_rays(rays, camera, longest) -> None:
-    frames, width = affordable(rays, camera, longest, None, None)
+    frames, width = choose_frames_and_width(rays, camera, longest, None, None)
     assert 6 <= frames <= 120
     assert 28 <= long_side(width, camera) <= longest
     assert width % 2 == 0
@@ -36,21 +36,21 @@ def test_a_video_keeps_to_its_rays(rays, camera, longest) -> None:
 def test_what_is_planned_for_any_photo_may_be_asked_for(rays: float, across: int, down: int, downscale: float) -> None:
     """A plan is read back as options, so it has to keep their bounds: of narrow photos, too."""
     camera = Camera("PINHOLE", across, down, (1.0, 1.0, 1.0, 1.0))
-    frames, width = affordable(rays, camera, longest_side(camera, downscale), None, None)
-    render.Config.model_validate({"frames": frames, "width": width, "fps": chosen_fps(frames)})
+    frames, width = choose_frames_and_width(rays, camera, max_useful_side(camera, downscale), None, None)
+    render.Config.model_validate({"frames": frames, "width": width, "fps": default_fps(frames)})
     assert width % 2 == 0
 
 
 @given(st.floats(1e3, 1e9), st.floats(1, 10), st.sampled_from([LANDSCAPE, PORTRAIT]), SIDES)
 def test_more_rays_never_give_less(rays, more, camera, longest) -> None:
-    (few, small), (many, large) = (affordable(r, camera, longest, None, None) for r in (rays, more * rays))
+    (few, small), (many, large) = (choose_frames_and_width(r, camera, longest, None, None) for r in (rays, more * rays))
     assert few <= many
     assert pixels(few, small, camera) <= 1.1 * pixels(many, large, camera)
 
 
 @given(st.floats(1e4, 1e9), SIDES)
 def test_rays_are_not_left_over_before_the_video_is_full(rays, longest) -> None:
-    frames, width = affordable(rays, LANDSCAPE, longest, None, None)
+    frames, width = choose_frames_and_width(rays, LANDSCAPE, longest, None, None)
     full = frames == 120 and width > 0.98 * longest
     assert full or pixels(frames, width, LANDSCAPE) > 0.8 * rays
 
@@ -67,13 +67,13 @@ def test_rays_are_not_left_over_before_the_video_is_full(rays, longest) -> None:
     ],
 )
 def test_growing_rays_go_into_size_then_length_then_size(squares: float, frames: int, side: int) -> None:
-    assert affordable(1.0001 * squares * 1000 / 1600, LANDSCAPE, 800.0, None, None) == (frames, side)
+    assert choose_frames_and_width(1.0001 * squares * 1000 / 1600, LANDSCAPE, 800.0, None, None) == (frames, side)
 
 
 def test_what_is_given_stands() -> None:
-    assert affordable(1000, LANDSCAPE, 800.0, 77, 640) == (77, 640)
-    assert affordable(10**7, LANDSCAPE, 800.0, None, 640) == (39, 640)
-    assert affordable(10**7, LANDSCAPE, 800.0, 100, None) == (100, 400)
+    assert choose_frames_and_width(1000, LANDSCAPE, 800.0, 77, 640) == (77, 640)
+    assert choose_frames_and_width(10**7, LANDSCAPE, 800.0, None, 640) == (39, 640)
+    assert choose_frames_and_width(10**7, LANDSCAPE, 800.0, 100, None) == (100, 400)
 
 
 @pytest.mark.parametrize(
@@ -81,9 +81,9 @@ def test_what_is_given_stands() -> None:
     [((1600, 1000), 2.0, 800), ((1600, 1000), 8.0, 480), ((150, 100), 1.0, 150), ((4000, 3000), 1.0, 1920)],
 )
 def test_no_larger_than_trained_unless_that_is_tiny(size: tuple[int, int], downscale: float, side: int) -> None:
-    assert longest_side(Camera("PINHOLE", *size, (1.0, 1.0, 1.0, 1.0)), downscale) == side
+    assert max_useful_side(Camera("PINHOLE", *size, (1.0, 1.0, 1.0, 1.0)), downscale) == side
 
 
 @pytest.mark.parametrize(("frames", "fps"), [(2, 1), (6, 2), (24, 6), (60, 15), (120, 30), (900, 30)])
 def test_short_paths_play_slowly(frames: int, fps: int) -> None:
-    assert chosen_fps(frames) == fps
+    assert default_fps(frames) == fps

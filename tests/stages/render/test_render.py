@@ -19,7 +19,7 @@ from stages import render
 from stages.contract import StageError
 from stages.io.files import read_json, write_json
 from stages.io.transforms_export import transforms
-from stages.render.path import CameraPath, fitted_path, median_camera, path_from_file, path_rays, resized
+from stages.render.path import CameraPath, make_path, median_camera, path_from_file, path_rays, resized
 from stages.render.video import STARTING_SECONDS
 from tests.camera_layouts import ring, wall
 from tests.refusals import refused
@@ -100,7 +100,7 @@ def test_video_and_depth_show_the_field_from_the_path(inputs, progress) -> None:
     assert {int(c.argmax()) for c in centre} == {0, 1}  # seen from both of its sides
     assert (depth[:, 30, 40, 0].astype(int) > depth[:, 30, 40, 2] + 50).all()  # near is red
     assert (depth[:, 3, 3, 0] < 100).all()  # far is not
-    assert result.line.startswith("orbit, 8 frames 80×60 · drawn at ")
+    assert result.line.startswith("orbit, 8 frames 80×60 · rendered at ")
     assert set(result.outputs) == {"video.mp4", "depth.mp4", "path.json"}
     assert result.records == ("speed.json",)
     assert sorted(file.name for file in inputs["render"].iterdir()) == sorted([*result.outputs, *result.records])
@@ -133,12 +133,12 @@ def test_depth_waits_on_the_disk_only_where_it_is_shown(inputs, progress, monkey
 
     @contextmanager
     def writer(path: Path, *_: int) -> Iterator[Callable[[np.ndarray], None]]:
-        yield lambda frame: waiting.append((path.parent / "inverse_depth.tmp").exists())
+        yield lambda frame: temporary.append((path.parent / "inverse_depth.tmp").exists())
 
-    waiting = list[bool]()
+    temporary = list[bool]()
     monkeypatch.setattr("stages.render.video.video_writer", writer)
     run(inputs, progress, frames=3, width=40, depth=depth)
-    assert waiting == (6 * [True] if depth else 3 * [False])
+    assert temporary == (6 * [True] if depth else 3 * [False])
     assert not (inputs["render"] / "inverse_depth.tmp").exists()
 
 
@@ -155,7 +155,7 @@ def test_plan_answers_every_open_question(inputs, progress) -> None:
     config = render.plan(render.Config(), inputs, progress)
     assert (config.path, config.frames, config.width, config.fps) == ("orbit", 6, 140, 2)
     words = "30 k rays/s here: 6 frames 140×104 take about 2.9 s, training took 10 s"
-    assert progress.notes == [f"{words}; more would take too long, --render.frames and --render.width ask for it"]
+    assert progress.notes == [f"{words}; more would take too long: use --render.frames and --render.width to get it"]
     assert render.plan(config, inputs, progress) == config
     assert len(progress.notes) == 1
 
@@ -176,7 +176,7 @@ def test_a_video_that_must_take_longer_than_training_says_so(inputs, progress) -
     render.plan(render.Config(frames=50), inputs, progress)
     assert [note.split("; ")[1] for note in progress.notes] == [
         "that is longer, but there is no smaller video",
-        "that is longer, as asked",
+        "that is longer, as requested",
     ]
 
 
@@ -207,7 +207,7 @@ def test_the_layout_chooses_the_path(
 def test_along_photos_that_face_one_way_the_horizon_is_level() -> None:
     poses = wall(columns=40)
     poses[::2, :, :2] *= -1  # upside down
-    path = fitted_path(scene_with(poses, "forward"), "interpolated", 30).poses
+    path = make_path(scene_with(poses, "forward"), "interpolated", 30).poses
     assert (path[:, 2, 1] < -0.99).all()
 
 
@@ -234,11 +234,11 @@ def test_ray_directions_are_made_per_frame_and_lens(monkeypatch) -> None:
     monkeypatch.setattr("stages.render.path.camera_rays", camera_rays)
     lenses = [replace(CAMERA, params=(focal, *CAMERA.params[1:])) for focal in (150.0, 150.0, 151.0, 152.0)]
     frames = path_rays(CameraPath(tuple(lenses), ring(4)), scene_with(ring(5)))
-    asked = []
+    given = []
     for _ in frames:
-        asked.append([focal for focal, _ in made])
+        given.append([focal for focal, _ in made])
         assert sum(rays() is not None for _, rays in made) == 1
-    assert asked == [[150], [150], [150, 151], [150, 151, 152]]
+    assert given == [[150], [150], [150, 151], [150, 151, 152]]
 
 
 def test_cameras_and_path_exclude_each_other(inputs, progress, tmp_path: Path) -> None:
@@ -302,7 +302,7 @@ def test_the_median_camera_keeps_the_angle_of_view() -> None:
     assert camera == Camera("PINHOLE", 160, 120, (150.0, 150.0, 80.0, 60.0))
     half = resized(camera, 80)
     assert (half.width, half.height, half.params) == (80, 60, (75.0, 75.0, 40.0, 30.0))
-    assert fitted_path(scene, "orbit", 7).cameras == (camera,) * 7
+    assert make_path(scene, "orbit", 7).cameras == (camera,) * 7
 
 
 @pytest.mark.parametrize(
@@ -374,14 +374,14 @@ def test_a_field_without_exposure_says_nothing_of_it(inputs, progress) -> None:
     assert "appearance" not in result.facts and "expos" not in result.line
     progress.notes.clear()
     assert "appearance" not in run(inputs, progress, frames=2, width=40, match_exposure="3.jpg").facts
-    assert progress.notes == ["exposure is not modelled: all photos count as exposed alike, and the video like 3.jpg"]
+    assert progress.notes == ["the field has no exposure model: all photos, and so 3.jpg, count as exposed alike"]
 
 
 @pytest.mark.parametrize(
     ("like", "level", "words", "note"),
     [
-        ("0.jpg", 0.6858, "exposed as expected of 0.jpg", "0.jpg was not trained on: its exposure is what the photos"),
-        ("81.jpg", 0.5, NEUTRAL, f"no photo 81.jpg has a camera: {NEUTRAL}; perhaps 8.jpg"),
+        ("0.jpg", 0.6858, "exposed as estimated for 0.jpg", "0.jpg is no training photo: its exposure is estimated"),
+        ("81.jpg", 0.5, NEUTRAL, f"there is no registered photo 81.jpg: {NEUTRAL}; did you mean 8.jpg"),
     ],
 )
 def test_missing_exposure_is_no_error_after_training(

@@ -9,7 +9,7 @@ import torch
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from stages.io.files import write_json
-from stages.render.renderer import Allowance, Renderer, trained_seconds
+from stages.render.renderer import Renderer, TimeBudget, trained_seconds
 
 
 class Slow:
@@ -43,7 +43,7 @@ def renderer(seconds_per_ray: float = 0.0) -> Renderer:
 
 def test_a_picture_has_every_ray_in_its_place() -> None:
     shares: list[float] = []
-    picture = renderer().draw(square(40), shares.append)
+    picture = renderer().render(square(40), shares.append)
     torch.testing.assert_close(picture.colour, square(40).directions * torch.tensor([1.0, 2.0, 3.0]))
     assert picture.depth.shape == picture.opacity.shape == (40, 40)
     assert shares == sorted(shares) and shares[-1] == 1.0
@@ -74,10 +74,10 @@ def test_training_took_as_long_as_its_curve_says(tmp_path: Path) -> None:
 
 def test_images_have_a_share_of_the_time_given(tmp_path: Path) -> None:
     write_json(tmp_path / "curve.json", {"points": [{"seconds": 50.0}]})
-    assert Allowance(None, tmp_path, 3.0).left() == 15.0
-    assert 5 < Allowance(10.0, tmp_path, 3.0).left() <= 7
-    assert 0 < Allowance(1.0, tmp_path, 3.0).left() <= 1
-    assert (Allowance(None, tmp_path, 3.0).words(), Allowance(10.0, tmp_path, 3.0).words()) == (
+    assert TimeBudget(None, tmp_path, 3.0).seconds_left() == 15.0
+    assert 5 < TimeBudget(10.0, tmp_path, 3.0).seconds_left() <= 7
+    assert 0 < TimeBudget(1.0, tmp_path, 3.0).seconds_left() <= 1
+    assert (TimeBudget(None, tmp_path, 3.0).message(), TimeBudget(10.0, tmp_path, 3.0).message()) == (
         "training took 50 s",
-        "given 10 s, of which 7 s are left for drawing",
+        "given 10 s, of which 7 s are left for rendering",
     )

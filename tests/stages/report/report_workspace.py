@@ -27,18 +27,18 @@ CAMERA_MODELS = [
         ("OPENCV_FISHEYE", "refined", 8, None, None, None, "its distortion cannot be undone at 2.0% of the pixels"),
     ]
 ]
-PARTS = {"steps_timed": 19, "seconds": 5.0, "core_seconds": 10.0, "floor_share": 0.6} | {
+SPANS = {"profiled_steps": 19, "seconds": 5.0, "core_seconds": 10.0, "efficiency": 0.6} | {
     "rays": 19_456,
-    "samples": 243_200,
-    "densities": 583_680,
+    "colour_evaluations": 243_200,
+    "density_evaluations": 583_680,
     "rates": {"matmul_flops": 80_123_456_789, "gathered_rows": 150_000_000, "streamed_bytes": 19_000_000_000},
-    "parts": [
-        {"part": "backward", "seconds": 5.0, "share": 0.5, "floor": 3.5},
-        {"part": "mlp", "seconds": 3.0, "share": 0.3, "floor": 1.9},
-        {"part": "waiting", "seconds": 1.0, "share": 0.1, "floor": None},
-        {"part": "rest", "seconds": 1.0, "share": 0.1, "floor": None},
+    "spans": [
+        {"span": "backward", "seconds": 5.0, "share": 0.5, "min_seconds": 3.5},
+        {"span": "mlp", "seconds": 3.0, "share": 0.3, "min_seconds": 1.9},
+        {"span": "idle", "seconds": 1.0, "share": 0.1, "min_seconds": None},
+        {"span": "rest", "seconds": 1.0, "share": 0.1, "min_seconds": None},
     ],
-    "most_rays_per_second": 7205.9,
+    "max_rays_per_second": 7205.9,
 }
 LINES = {
     "ingest": "24 photos 96×72, one camera",
@@ -125,10 +125,10 @@ def _write_training(folder: Path) -> None:
         | {"probe_ssim": 0.8 - 0.4 * 0.8**k}
         for k in range(13)
     ]
-    about = {"field": "grid", "device": "cpu", "threads": 2, "whole": True}
+    about = {"field": "grid", "device": "cpu", "threads": 2, "single_cycle": True}
     write_json(folder / "curve.json", about | {"points": curve})
-    write_json(folder / "field.json", {"kind": "paper", "downscale": 1.0, "steps": 600, "rays": 600_000})
-    write_json(folder / "profile.json", PARTS)
+    write_json(folder / "field.json", {"kind": "vanilla", "downscale": 1.0, "steps": 600, "rays": 600_000})
+    write_json(folder / "profile.json", SPANS)
 
 
 def _write_metrics(folder: Path, scene: Scene, size: tuple[int, int]) -> None:

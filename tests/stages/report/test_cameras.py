@@ -26,6 +26,8 @@ def check(**changed: Any) -> dict[str, Any]:
         "agreeing": 780,
         "error_px": 0.25,
         "tolerance_px": 0.75,
+        "noise_px": 0.18,
+        "fits": True,
         "doubtful": [],
         "weak_links": [],
         "sequence_breaks": [],
@@ -35,7 +37,7 @@ def check(**changed: Any) -> dict[str, Any]:
 
 def opinion(**changed: Any) -> dict[str, Any]:
     agree = {"photos": PHOTOS, "agree": PHOTOS, "different": [], "centre": 0.0006, "degrees": 0.02, "failed": None}
-    return agree | {"agreeing": 100, "agreeing_global": 100} | changed
+    return agree | {"agreeing": 100, "agreeing_other": 100, "taken": False} | changed
 
 
 def weak(*counts: int) -> list[dict[str, Any]]:
@@ -60,6 +62,7 @@ def test_cameras_that_agree_are_said_to_with_figures() -> None:
     [
         ({"check": check(doubtful=files(4))}, 1),
         ({"check": check(agreeing=399)}, 0),
+        ({"check": check(error_px=0.96, fits=False)}, 0),
         ({"check": check(weak_links=weak(2))}, 1),
         ({"check": check(sequence_breaks=[[file, file] for file in files(4)])}, 1),
         ({"check": check(weak_links=[{"photos": [file], "pairs": 1, "matches": 9} for file in files(4)])}, 1),
@@ -82,7 +85,7 @@ def test_each_kind_of_doubt_makes_the_cameras_doubtful(changed: dict[str, Any], 
         ({"check": check(weak_links=weak(1))}, 1),
         ({"check": check(sequence_breaks=[[file, file] for file in files(3)])}, 1),
         ({"global_mapping": opinion(different=files(3))}, 0),
-        ({"global_mapping": opinion(different=files(40), agreeing_global=89)}, 0),
+        ({"global_mapping": opinion(different=files(40), agreeing_other=89)}, 0),
         ({"global_mapping": {"failed": "global mapping found no model"}}, 0),
     ],
 )
@@ -102,7 +105,7 @@ def test_weak_links_are_shown_largest_first() -> None:
 
 
 def test_a_contradicted_global_mapping_casts_no_doubt() -> None:
-    said = camera_report(registration(global_mapping=opinion(different=files(40), agreeing_global=89)), {})
+    said = camera_report(registration(global_mapping=opinion(different=files(40), agreeing_other=89)), {})
     assert said.figures and re.findall(r"[\d.]*\d", said.figures)[3:] == ["40", "89", "100"]
 
 

@@ -14,10 +14,10 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 
 from nerf.geometry.scene import Camera, Scene, Similarity, View
-from nerf.training.learning_curve import Gain
+from nerf.training.learning_curve import PredictedGain
 from stages.report import plots
 from stages.report.plots import ORDER_COLOURS, _outline, camera_svgs, curve_svg
-from stages.train.curve import coming_doubling
+from stages.train.curve import predicted_gain
 
 
 def _scene(count: int = 9) -> Scene:
@@ -68,13 +68,14 @@ def test_plots_of_one_page_share_no_identifier():
 
 
 def test_the_curve_shows_prediction_and_knee():
-    steep = curve_svg(_curve(), {}, coming_doubling("grid", True, _curve())) or ""
-    assert "predicted" in steep and "knee" not in steep
+    steep = curve_svg(_curve(), {}, predicted_gain("grid", True, _curve())) or ""
+    assert "predicted" in steep and "diminishing returns" not in steep
     flat = [row | {"probe_psnr": 20 - 8 / row["seconds"]} for row in _curve()]
-    assert "knee, 16 s" in (curve_svg(flat, {}) or "")
+    assert "diminishing returns, 16 s" in (curve_svg(flat, {}) or "")
     unknown = [row | {"probe_psnr": None} for row in _curve()]
-    for about in (("grid", True, unknown), ("paper", True, _curve()), ("grid", False, _curve())):
-        assert coming_doubling(*about) is None
+    assert predicted_gain("grid", True, unknown) is None
+    assert predicted_gain("vanilla", True, _curve()) is None
+    assert predicted_gain("grid", False, _curve()) is None
     assert "predicted" not in (curve_svg(unknown, {}) or "predicted")
 
 
@@ -86,7 +87,7 @@ def test_curve_names_its_lines_and_needs_two_points():
 
 
 def test_neighbouring_times_do_not_run_into_each_other():
-    svg = curve_svg(_curve(), {}, coming_doubling("grid", True, _curve())) or ""
+    svg = curve_svg(_curve(), {}, predicted_gain("grid", True, _curve())) or ""
     times = [text for text in re.findall(r"<text[^>]*>([^<]+)</text>", svg) if re.fullmatch(r"[\d.]+ (s|min)", text)]
     assert {"2 min", "8 s", "4 min", "16 s"} <= set(times) and "min 8" not in svg
 
@@ -94,7 +95,7 @@ def test_neighbouring_times_do_not_run_into_each_other():
 def test_the_prediction_lies_inside_the_plot(monkeypatch: pytest.MonkeyPatch):
     tops: list[float] = []
     monkeypatch.setattr(plots, "svg_element", lambda figure: str(tops.append(figure.axes[0].get_ylim()[1])))
-    curve, coming = _curve(), Gain(8.0, 0.5)
+    curve, coming = _curve(), PredictedGain(8.0, 0.5)
     curve_svg(curve, {"nearest photo": 14.2}, coming)
     assert curve[-1]["probe_psnr"] + 8.5 <= tops[0] < 40
 

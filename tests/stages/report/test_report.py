@@ -14,7 +14,7 @@ from stages.io.files import read_json, write_json
 from stages.report import page
 from stages.tradeoff.pareto_front import recommend, table
 from tests.refusals import refused
-from tests.stages.report.report_workspace import LINES, PARTS, make_workspace, written
+from tests.stages.report.report_workspace import LINES, SPANS, make_workspace, written
 from tests.stages.tradeoff.test_pareto_front import point
 
 
@@ -57,13 +57,13 @@ def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path
         "reprojection_px": 0.61,
         "cameras_verdict": None,
         "cameras_doubtful": False,
-        "field": "paper",
+        "field": "vanilla",
         "train_seconds": 183.3,
         "total_seconds": pytest.approx(58.2 + 181.7 + 60.1 + 4 * 2.5),
         "stage_seconds": {"ingest": 2.5, "sfm": 58.2, "normalise": 2.5, "train": 181.7}
         | {"evaluate": 2.5, "render": 60.1, "mesh": 2.5},
         "expected_seconds": {},
-        "training_parts": PARTS,
+        "training_profile": SPANS,
         "psnr": 21.5,
         "ssim": 0.62,
         "psnr_mean_image": 12.9,
@@ -143,7 +143,7 @@ def test_page_answers_questions_in_order(inputs: dict[str, Path], tmp_path: Path
         '<span class="tag">median</span> &lt;script&gt;alert(1)',
         '<span class="tag">worst</span> IMG_0000.jpg',
         "All 6 test photos",
-        "bought +0.5 dB on test pixels",
+        "gained +0.5 dB on test pixels",
         "diverged or met non-finite values 2 times.",
         "from above",
         "only 12 matches with any other photo",
@@ -228,14 +228,14 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
     study |= {
         "workspace_field": None,
         "scored": "6 crops of 2 held-out photos",
-        "left_out": ["paper, published: 5 steps"],
+        "left_out": ["vanilla, published: 5 steps"],
     }
     write_json(inputs["tradeoff"] / "tradeoff.json", study)
     (inputs["tradeoff"] / "manifest.json").write_text('{"seconds": 1800}')
     assert "What quality costs here" not in before
     text, summary = written(inputs, tmp_path / "out", progress)
     assert "What quality costs here" in text and study["recommendation"] in text
-    for words in ("All 3 settings", "<b>23.00 ± 0.20</b>", ">18.00<", "6 crops of 2", "paper, published: 5 steps"):
+    for words in ("All 3 settings", "<b>23.00 ± 0.20</b>", ">18.00<", "6 crops of 2", "vanilla, published: 5 steps"):
         assert words in text, words
     assert "reduced, a part left out" in text, "the plot's legend"
     assert "Train it: <code>pipeline train fox.nerf --train.seconds 20</code>" in text
@@ -331,13 +331,13 @@ def test_training_shows_where_its_time_went(inputs: dict[str, Path], tmp_path: P
 def test_a_training_without_timed_steps_is_no_fault(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     (inputs["train"] / "profile.json").unlink()
     html, summary = written(inputs, tmp_path / "out", progress)
-    assert "Where training spent its time" not in html and summary["training_parts"] is None
+    assert "Where training spent its time" not in html and summary["training_profile"] is None
 
 
 def test_a_field_of_no_use_is_named(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     path = inputs["train"] / "manifest.json"
     manifest = json.loads(path.read_text("utf-8"))
-    manifest["facts"]["symptom"] = "it is empty (mean opacity 0e+00)"
+    manifest["facts"]["failure_reason"] = "it is empty (mean opacity 0e+00)"
     write_json(path, manifest)
     html, _ = written(inputs, tmp_path / "out", progress)
     assert "<b>The field is undertrained:</b> it is empty (mean opacity 0e+00)." in html

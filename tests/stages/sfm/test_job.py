@@ -12,7 +12,7 @@ from PIL import Image
 from stages import sfm
 from stages.sfm import worker_process
 from stages.sfm.job import PHASE_SECONDS, Job, JobState, PhaseTimer
-from stages.sfm.retry_strategies import MAX_SECONDS_LIMIT, NO_TIME, OUT_OF_TIME, TIME_GIVEN, skipped_for_time
+from stages.sfm.retry_strategies import MAX_SECONDS_LIMIT, NO_TIME, OUT_OF_TIME, TIME_GIVEN, Outcome, skipped_for_time
 from tests.refusals import refused
 from tests.stages.sfm.sfm_inputs import SMALL, ingested
 from tests.synthetic_photos import SyntheticPhotos
@@ -76,6 +76,14 @@ def test_the_time_given_is_for_all_runs_together(
     second = work(tmp_path, seconds, max_seconds)
     wait(50)
     assert second.left() == (left, limit)
+
+
+@pytest.mark.parametrize(("fits", "missing"), [(True, [3]), (False, [0, 1, 2, 3])])
+def test_a_misfit_registers_no_image(tmp_path: Path, fits: bool, missing: list[int]) -> None:
+    state = work(tmp_path, None, 900.0)
+    state.files = ["a", "b", "c", "d"]
+    state.log.outcomes = [Outcome("default", "matches.db", [["a", "b", "c"]], points=500, fits=fits)]
+    assert state.missing() == missing
 
 
 def test_strategies_skipped_for_time_are_counted() -> None:

@@ -27,6 +27,7 @@ def test_more_photos_beat_more_points_beat_less_error() -> None:
     groups = [["a", "b", "c"], ["d"]]
     ranked = [
         Outcome("none", "x.db"),
+        Outcome("misfit", "x.db", groups, 900, 0.1, fits=False),
         Outcome("few", "x.db", [["a", "b"]], 900, 0.1),
         Outcome("inexact", "x.db", groups, 500, 0.9),
         Outcome("exact", "x.db", groups, 500, 0.3),
@@ -137,6 +138,13 @@ APART = "the missing photos form models of their own and share too few matches w
             "consecutive pairs",
             {"missing": 4, "sequence_broken": True},
             "4 of 50 photos missing is not worth starting over",
+        ),
+        ("other seed", {"missing": 50, "misfit": True}, None),
+        ("fisheye", {"missing": 50, "misfit": True}, None),
+        (
+            "more features",
+            {"missing": 50, "misfit": True},
+            "there are matches enough, and the cameras do not fit them",
         ),
         (
             "fisheye",

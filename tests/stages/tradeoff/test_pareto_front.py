@@ -21,7 +21,7 @@ from stages.tradeoff.pareto_front import (
     recommended_index,
     table,
 )
-from stages.tradeoff.schedule import PUBLISHED, REDUCED, VARIANTS, WORKSPACE_FIELD, Run, field_of, train_command
+from stages.tradeoff.schedule import PUBLISHED, REDUCED, VARIANTS, WORKSPACE_FIELD, Run, field_name, train_command
 from stages.train import Config
 
 
@@ -30,7 +30,7 @@ def point(seconds: float, psnr: float, **others: Any) -> Point:
     usual: dict[str, Any] = {"variant": "grid", "downscale": 2.0, "seeds": 1, "psnr_std": None, "ssim": 0.9}
     usual |= {"frame_seconds": 1.0, "peak_memory_mb": 500, "model_mb": 10.0, "steps": round(10 * seconds)}
     variant = others.get("variant", "grid")
-    usual |= {"ssim_std": None, "field": "grid" if variant == WORKSPACE_FIELD else field_of(variant)}
+    usual |= {"ssim_std": None, "field": "grid" if variant == WORKSPACE_FIELD else field_name(variant)}
     return Point(psnr=psnr, train_seconds=seconds, **(usual | others))
 
 
@@ -124,12 +124,14 @@ def test_the_command_of_a_setting_asks_for_what_it_was(variant: str, space: Spac
     assert given.settings.train == asked.model_copy(update=usual)
 
 
-@pytest.mark.parametrize("remembered", [{"preset": "paper", "width": 64}, {"field": "grid", "levels": 3, "steps": 9}])
+@pytest.mark.parametrize(
+    "remembered", [{"preset": "paper", "vanilla": {"width": 64}}, {"grid": {"num_levels": 3}, "steps": 9}]
+)
 @pytest.mark.parametrize("variant", ["grid", REDUCED, PUBLISHED])
 def test_the_command_is_taken_whatever_field_a_workspace_remembers(variant: str, remembered: dict[str, Any]) -> None:
     words = shlex.split(train_command(variant, 48.6, 2.0, "contracted", "fox.nerf"))[2:]
     train = parse(StageArguments, "train", words, Settings(train=Config(**remembered))).settings.train
-    assert (train.kind, train.steps, train.seconds) == (field_of(variant), None, 49)
+    assert (train.kind, train.steps, train.seconds) == (field_name(variant), None, 49)
     assert train.preset == VARIANTS[variant].options.get("preset", "standard")
 
 
@@ -142,12 +144,12 @@ def test_the_command_names_a_workspace_whose_name_is_not_unicode() -> None:
 # Settings of the study of fox in docs/results.md: seconds, dB, deviation over two seeds.
 FOX_GRID = [(2.1, 14.09, 0.86), (3.8, 15.99, 1.69), (6.6, 18.61, 1.73), (10.8, 21.67, 0.51), (18.3, 24.83, 0.22)]
 FOX_GRID += [(30.4, 27.72, 0.03), (48.9, 29.26, 0.05)]
-FOX_PAPER = [(26.8, 18.79, 0.84), (27.3, 18.91, 0.88)]
+FOX_VANILLA = [(26.8, 18.79, 0.84), (27.3, 18.91, 0.88)]
 
 
 def test_short_trainings_spread_is_no_noise_of_long_ones() -> None:
     points = [point(s, psnr, seeds=2, psnr_std=d, downscale=4.0) for s, psnr, d in FOX_GRID]
-    points += [point(s, psnr, seeds=2, psnr_std=d, variant="paper, reduced") for s, psnr, d in FOX_PAPER]
+    points += [point(s, psnr, seeds=2, psnr_std=d, variant="vanilla, reduced") for s, psnr, d in FOX_VANILLA]
     points.append(point(83.7, 30.48, downscale=4.0))
     points = [replace(p, spread=pooled_spread(p, points)) for p in points]
     assert points[-1].spread == pytest.approx(((0.05**2 + 0.03**2 + 0.22**2) / 3) ** 0.5)
@@ -158,10 +160,13 @@ def test_short_trainings_spread_is_no_noise_of_long_ones() -> None:
 
 
 def test_one_fields_spread_is_not_anothers() -> None:
-    grid, paper = point(10, 20, seeds=4, psnr_std=0.1), point(10, 15, seeds=4, psnr_std=1.0, variant="paper, reduced")
+    grid, vanilla = (
+        point(10, 20, seeds=4, psnr_std=0.1),
+        point(10, 15, seeds=4, psnr_std=1.0, variant="vanilla, reduced"),
+    )
     ablated = point(11, 15, variant="no view dependence")
-    assert pooled_spread(point(12, 20), [grid, paper]) == pytest.approx(0.1)
-    assert pooled_spread(ablated, [grid, paper]) == pytest.approx(1.0)
+    assert pooled_spread(point(12, 20), [grid, vanilla]) == pytest.approx(0.1)
+    assert pooled_spread(ablated, [grid, vanilla]) == pytest.approx(1.0)
     assert pooled_spread(ablated, [grid, ablated]) == pytest.approx(0.1)
 
 
@@ -238,8 +243,8 @@ def test_more_time_is_not_advised_without_gain() -> None:
     assert not first.still_rising and first.words.endswith(". Nothing tried is better.")
     about_as_long = recommend([*doublings([3.0]), point(23, 22.5)])
     assert about_as_long.still_rising and "longer than 23 s, a larger --budget" in about_as_long.words
-    other_kind = recommend([*doublings([3.0]), point(90, 15.0, variant="paper, reduced")])
-    assert other_kind.still_rising, "what the paper's networks do tells nothing of a grid"
+    other_kind = recommend([*doublings([3.0]), point(90, 15.0, variant="vanilla, reduced")])
+    assert other_kind.still_rising, "what a vanilla NeRF does tells nothing of a grid"
 
 
 def test_the_fastest_point_of_the_front_is_marked() -> None:

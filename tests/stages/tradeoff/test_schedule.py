@@ -44,16 +44,18 @@ CORES |= {REDUCED: Speed(27.0, 6.9e3), PUBLISHED: Speed(0.066, 68.0), FEWER_RAYS
 @SPACES
 def test_every_variant_is_one_that_stage_train_takes(space: Space) -> None:
     for run in make_schedule(1e4, 1, space, SIZES, FAST, 1000).runs:
-        assert Config(**run.options).kind == ("grid" if "grid" in run.variant else "paper")
+        assert Config(**run.options).kind == ("grid" if "grid" in run.variant else "vanilla")
 
 
 @SPACES
 def test_a_study_uses_training_grid_sizes(space: Space) -> None:
     def sizes(variant: str) -> tuple[int, ...]:
-        return tuple(train_options(variant, space)[name] for name in ("levels", "log2_rows", "finest"))
+        return tuple(
+            train_options(variant, space)["grid"][name] for name in ("num_levels", "log2_hashmap_size", "max_res")
+        )
 
     usual = [run for run in make_schedule(1e4, 1, space, SIZES, FAST, 1000).runs if run.variant == "grid"]
-    assert {run.options["finest"] for run in usual} == {512 if space == "bounded" else 1024}
+    assert {run.options["grid"]["max_res"] for run in usual} == {512 if space == "bounded" else 1024}
     chosen = [tuple(entry[1:]) for entry in hash_grid.SIZES[space]]
     assert [sizes("grid"), sizes("small grid")] == chosen
     assert sizes("grid, half the samples") == sizes("grid, twice the samples") == sizes("grid")
@@ -66,16 +68,16 @@ def test_every_variant_is_explained_with_its_sizes(space: Space) -> None:
     for name, variant in VARIANTS.items():
         said = describe([name], space)
         if variant.family.startswith("grid"):
-            assert f"{train_options(name, space)['levels']} grids" in said
+            assert f"{train_options(name, space)['grid']['num_levels']} grids" in said
         if variant.family == "grid":
-            assert f"{train_options(name, space)['finest']:,}³ cells" in said
+            assert f"{train_options(name, space)['grid']['max_res']:,}³ cells" in said
     assert (
         describe([WORKSPACE_FIELD, "grid"], space)
         == f"{describe(['grid'], space)}; {WORKSPACE_FIELD}: {DESCRIPTIONS[WORKSPACE_FIELD]}"
     )
-    networks = {REDUCED: "small", PUBLISHED: "published", FEWER_RAYS: "published"}
-    for name, preset in networks.items():
-        sizes = {**vanilla.SIZES[preset], **VARIANTS[name].options}
+    networks = {REDUCED: vanilla.REDUCED, PUBLISHED: vanilla.PUBLISHED, FEWER_RAYS: vanilla.PUBLISHED}
+    for name, usual in networks.items():
+        sizes = usual["vanilla"] | VARIANTS[name].options.get("vanilla", {})
         words = "{depth} layers of {width}, {samples_coarse} + {samples_fine} samples".format(**sizes)
         assert words in DESCRIPTIONS[name] and f"{sizes['batch_rays']:,} rays a step" in DESCRIPTIONS[name]
 
@@ -175,7 +177,7 @@ def test_what_is_too_slow_is_named() -> None:
     speeds = FAST | {PUBLISHED: Speed(0.01, 10.0)}
     made = make_schedule(1800, 1, "bounded", SIZES, speeds, 1000)
     assert PUBLISHED not in {run.variant for run in made.runs}
-    assert "paper, published at 1/8 of the resolution: 1 steps (fewer than 300)" in made.left_out
+    assert "vanilla, published at 1/8 of the resolution: 1 steps (fewer than 300)" in made.left_out
 
 
 def test_seeds_come_first_where_the_spread_is_judged() -> None:
@@ -203,7 +205,7 @@ def test_photo_sizes_are_distinct_and_not_tiny(
 
 def test_half_and_twice_the_samples_keep_steps() -> None:
     runs = {run.variant: run for run in make_schedule(1e4, 1, "bounded", SIZES, FAST, 0).runs}
-    half, twice = runs["paper, half the samples"], runs["paper, twice the samples"]
+    half, twice = runs["vanilla, half the samples"], runs["vanilla, twice the samples"]
     assert half.steps == twice.steps
     assert twice.seconds == pytest.approx(4 * half.seconds, rel=0.01)
 

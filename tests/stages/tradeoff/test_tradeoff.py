@@ -1,7 +1,6 @@
 import mmap
 import shutil
 import time
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,13 +20,18 @@ from stages.io.files import read_json, read_scene, write_json
 from stages.tradeoff import Config, benchmark, schedule, study
 from stages.tradeoff.benchmark import score_workspace_field
 from stages.tradeoff.schedule import FEWER_RAYS, PUBLISHED, VARIANTS, WORKSPACE_FIELD, Run, Speed
-from stages.train.config import WHITE
+from stages.train.config import WHITE, FieldName
 from stages.train.data import PhotoReader, view_rays
+from stages.train.fields.hash_grid_options import HashGridOptions
+from stages.train.fields.vanilla_options import VanillaOptions
 from tests.refusals import refused
 from tests.stages.photo_scene import photographed
 
-TINY_GRID: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024}
-TINY_PAPER = {"depth": 2, "width": 16, "samples_coarse": 8, "samples_fine": 8, "batch_rays": 64}
+TINY: dict[FieldName, dict[str, Any]] = {
+    "grid": {"num_levels": 2, "log2_hashmap_size": 10, "max_res": 32, "target_samples": 1024},
+    "vanilla": {"depth": 2, "width": 16, "samples_coarse": 8, "samples_fine": 8, "batch_rays": 64},
+}
+TINY_GRID = HashGridOptions(**TINY["grid"])
 SPEEDS: dict[str, Any] = dict.fromkeys(schedule.TIMED, (200.0, 1e7))
 SPEEDS |= dict.fromkeys((PUBLISHED, FEWER_RAYS), (0.1, 10.0))
 CONFIG: dict[str, Any] = {
@@ -44,8 +48,9 @@ CONFIG: dict[str, Any] = {
 def tiny_fields(monkeypatch: pytest.MonkeyPatch) -> None:
     """The variants as they are, in sizes that train in a blink; few of them, none left out for a busy machine."""
     for name, variant in VARIANTS.items():
-        sizes: Mapping[str, Any] = TINY_GRID if variant.family.startswith("grid") else TINY_PAPER
-        kept = {key: value for key, value in variant.options.items() if key not in (*TINY_GRID, "preset")}
+        field = schedule.field_name(name)
+        sizes = {field: {**variant.options.get(field, {}), **TINY[field]}}
+        kept = {key: value for key, value in variant.options.items() if key != "preset"}
         monkeypatch.setitem(VARIANTS, name, variant._replace(options=kept | sizes, grid_size=None))
     monkeypatch.setattr(schedule, "WALL_TIME_RATIO", 1.0)
     monkeypatch.setattr(schedule, "OTHER_TIME", 0.6)
@@ -74,12 +79,12 @@ def test_a_study_is_the_same_after_a_kill(
     assert {"quality.json", "ablation.png", "tradeoff.json", "tradeoff.md", "tradeoff.svg", "tradeoff.png"} == files
     assert all((tmp_path / "whole" / name).stat().st_size > 0 for name in files)
     content = read_json(tmp_path / "whole" / "tradeoff.json")
-    assert {row["variant"] for row in content["points"]} >= {"grid", "paper, reduced", "no positional encoding"}
+    assert {row["variant"] for row in content["points"]} >= {"grid", "vanilla, reduced", "no positional encoding"}
     assert any(row["seeds"] == 2 and row["psnr_std"] > 0 for row in content["points"])
     for row in content["points"]:
         assert 5 < row["psnr"] < 60 and row["train_seconds"] > 0 and row["frame_seconds"] > 0
         assert 0.001 < row["model_mb"] < 10 and 50 < row["peak_memory_mb"] < 100_000
-    assert "paper, published at full resolution: 1 steps (fewer than 300)" in content["left_out"]
+    assert "vanilla, published at full resolution: 1 steps (fewer than 300)" in content["left_out"]
     assert content["points"][content["recommended"] - 1]["pareto_front"]
     assert content["recommendation"] in (tmp_path / "whole" / "tradeoff.md").read_text()
     assert result.line.endswith(f"{content['recommendation']} Train it: {content['command']}")
@@ -209,7 +214,7 @@ def test_a_study_out_of_time_still_has_a_result(
 def test_the_workspaces_field_is_a_point_without_output(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
     own = tmp_path / "train" / "0123456789abcdef"
     own.mkdir(parents=True)
-    facts = train.run(train.Config(steps=70, downscale=1.0, **TINY_GRID), photos, own, progress).facts
+    facts = train.run(train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, own, progress).facts
     write_json(own / "manifest.json", {"facts": facts})
     with_own = studied(tmp_path / "own", photos | {"train": own}, progress)
     without = studied(tmp_path / "none", photos, progress)
@@ -228,9 +233,9 @@ def test_the_workspaces_field_is_a_point_without_output(tmp_path: Path, photos: 
 def test_the_workspaces_slow_field_is_scored_on_some_pixels(
     tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    own, kind = tmp_path / "train" / "0123456789abcdef", {"field": "paper", **TINY_PAPER}
+    own, kind = tmp_path / "train" / "0123456789abcdef", VanillaOptions(**TINY["vanilla"])
     own.mkdir(parents=True)
-    facts = train.run(train.Config(steps=70, downscale=1.0, **kind), photos, own, progress).facts
+    facts = train.run(train.Config(steps=70, downscale=1.0, vanilla=kind), photos, own, progress).facts
     write_json(own / "manifest.json", {"facts": facts})
     crops = benchmark.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
     assert 0 < benchmark.rendering_seconds(own, crops) < 10
@@ -239,7 +244,7 @@ def test_the_workspaces_slow_field_is_scored_on_some_pixels(
         folder.mkdir()
         found = score_workspace_field(crops, photos | {"train": own}, folder, seconds, progress)
         assert found and (found.stride, found.key) == (stride, "0123456789abcdef")
-        assert (found.figures["ssim"] is None) == (stride > 1) and found.facts["field"] == "paper"
+        assert (found.figures["ssim"] is None) == (stride > 1) and found.facts["field"] == "vanilla"
         assert score_workspace_field(crops, photos | {"train": own}, folder, 1e3, progress) == found, (
             "as an earlier attempt found"
         )
@@ -251,7 +256,7 @@ def test_the_workspaces_slow_field_is_scored_on_some_pixels(
 
 def test_a_slow_field_is_scored_on_the_same_crops(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
     scene = read_scene(photos["normalise"])
-    train.run(train.Config(steps=70, downscale=1.0, **TINY_GRID), photos, tmp_path, progress)
+    train.run(train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, tmp_path, progress)
     crops = benchmark.make_benchmark(photos["ingest"], scene, 1.0, 4, 1.0)
     whole, thinned = (benchmark.score(tmp_path, crops, progress, stride) for stride in (1, 4))
     assert whole["ssim"] is not None and thinned["ssim"] is None
@@ -261,7 +266,7 @@ def test_a_slow_field_is_scored_on_the_same_crops(tmp_path: Path, photos: dict[s
 def test_fields_are_scored_over_the_photos_background(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
     white, black = tmp_path / "white", tmp_path / "black"
     white.mkdir()
-    train.run(train.Config(steps=70, downscale=1.0, **TINY_GRID), photos, white, progress)
+    train.run(train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, white, progress)
     shutil.copytree(white, black)
     field = read_json(white / "field.json")
     write_json(black / "field.json", field | {"background": [0.0, 0.0, 0.0]})
@@ -277,7 +282,7 @@ def test_a_run_that_does_not_learn_is_told(
     whole = train.run
 
     def diverges(config: train.Config, *rest: Any) -> Any:
-        if not config.positional_encoding:
+        if not config.vanilla.positional_encoding:
             raise StageError("train.diverged", "training diverged", "it was told to", "Do not tell it to.")
         return whole(config, *rest)
 

@@ -11,11 +11,11 @@ from torch import Tensor
 from nerf.effects import NO_EFFECTS, HeldOutImages, Images
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
+from nerf.training.evaluation_pixels import EvaluationPatches, EvaluationPixels
 from nerf.training.trainer import StepResult
-from nerf.training.validation_probe import Patches, Probe
 from stages.train.loop import TrainingRun
-from stages.train.state import Probes, TrainingBudget, TrainingLog
-from stages.train.validation_images import Target, Unseen
+from stages.train.state import EvaluationSets, TrainingBudget, TrainingLog
+from stages.train.validation_images import HeldOutEvaluation, Target
 
 
 class Killed(BaseException):
@@ -32,7 +32,7 @@ class OneNumber:
         self.seed, self.trouble = seed, trouble
         self.value = torch.tensor(float(seed))
         self.history: list[tuple[int, float, float]] = []
-        self.opacity, self.shown = 1.0, probe().colours + 0.1
+        self.opacity, self.shown = 1.0, pixels().colours + 0.1
 
     @property
     def model(self) -> "OneNumber":
@@ -42,7 +42,7 @@ class OneNumber:
         self.trouble(step, lr_scale)
         self.history.append((step, progress, lr_scale))
         self.value = self.value * 0.9 + lr_scale * (1 - progress) * torch.sin(torch.tensor(float(step)))
-        return StepResult(float(self.value), 20.0, rays=4, samples=12, densities=20)
+        return StepResult(float(self.value), 20.0, rays=4, colour_evaluations=12, density_evaluations=20)
 
     def state(self) -> dict[str, Tensor]:
         return {"value": self.value}
@@ -69,16 +69,17 @@ def slow(step: int, lr_scale: float) -> None:
     time.sleep(0.003)
 
 
-def probe() -> Probe:
+def pixels() -> EvaluationPixels:
     """Two rays, one to see black and one grey: a flat colour leaves a mean error of 1/16."""
     rays = Rays(torch.zeros(2, 3), torch.ones(2, 3), torch.ones(2), torch.ones(2))
-    return Probe(rays, torch.tensor([[0.0] * 3, [0.5] * 3]), torch.zeros(3), torch.tensor([0, 1]))
+    return EvaluationPixels(rays, torch.tensor([[0.0] * 3, [0.5] * 3]), torch.zeros(3), torch.tensor([0, 1]))
 
 
-def unseen() -> Unseen:
+def held_out() -> HeldOutEvaluation:
     """The same rays; their patches are too small for SSIM."""
     photos = HeldOutImages(Images(torch.zeros(2, 3, 4)), torch.eye(2))
-    return Unseen(probe(), Patches(probe(), torch.ones(2, 1, 1, dtype=torch.bool)), photos)
+    patches = EvaluationPatches(pixels(), torch.ones(2, 1, 1, dtype=torch.bool))
+    return HeldOutEvaluation(pixels(), patches, photos)
 
 
 def run_in(
@@ -90,9 +91,12 @@ def run_in(
     checkpoint_seconds: float | None = 1e-9,
 ) -> TrainingRun:
     folder.mkdir(exist_ok=True)
-    maker, probes = make or (lambda attempt: OneNumber(attempt, quiet)), Probes(probe(), unseen(), target)
+    maker, evaluation_sets = (
+        make or (lambda attempt: OneNumber(attempt, quiet)),
+        EvaluationSets(pixels(), held_out(), target),
+    )
     budget, log = budget or TrainingBudget(40, None), TrainingLog(folder, False)
-    return TrainingRun(maker, probes, budget, folder, checkpoint_seconds, log, progress)
+    return TrainingRun(maker, evaluation_sets, budget, folder, checkpoint_seconds, log, progress)
 
 
 def number_of(run: TrainingRun) -> OneNumber:

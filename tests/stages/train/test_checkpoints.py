@@ -87,11 +87,11 @@ def test_not_finite_facts_are_refused(tmp_path: Path) -> None:
 
 
 def test_writing_replaces_the_whole_file(tmp_path: Path) -> None:
-    path = tmp_path / "plan.json"
+    path = tmp_path / "schedule.json"
     write_durably(path, json.dumps(list(range(100))).encode())
     write_durably(path, b"[]")
     assert path.read_bytes() == b"[]"
-    assert [p.name for p in tmp_path.iterdir()] == ["plan.json"]
+    assert [p.name for p in tmp_path.iterdir()] == ["schedule.json"]
 
 
 def test_no_flipped_bit_of_either_file_passes(tmp_path: Path) -> None:

@@ -2,30 +2,30 @@
 
 import pytest
 
-from nerf.training.learning_curve import Gain
-from stages.train.curve import doubling_words, next_words, ssim_words
+from nerf.training.learning_curve import PredictedGain
+from stages.train.curve import doubling_message, predicted_gain_message, ssim_message
 
 POINTS = [{"seconds": 10.0 * 2**k, "probe_psnr": 20.0 + k} for k in range(5)]
 
 
 def test_doublings_are_of_training_time() -> None:
-    last = "the last doubling of training time, to 2 min 40 s, bought +1.0 dB on test pixels"
-    assert doubling_words(POINTS, None) == last
+    last = "the last doubling of training time, to 2 min 40 s, gained +1.0 dB on test pixels"
+    assert doubling_message(POINTS, None) == last
     less = "(less over a run of half the time, which would have ended above this curve)"
-    again = "as long again at these sizes (--more 160s) is predicted to buy +0.7 dB (± 0.4)"
-    assert doubling_words(POINTS, Gain(0.71, 0.37)) == f"{last} {less}; {again}"
-    assert doubling_words(POINTS[-1:], None) is None
+    again = "as long again at these sizes (--more 160s) is predicted to gain +0.7 dB (± 0.4)"
+    assert doubling_message(POINTS, PredictedGain(0.71, 0.37)) == f"{last} {less}; {again}"
+    assert doubling_message(POINTS[-1:], None) is None
 
 
 def test_in_a_line_it_is_said_of_what() -> None:
-    said = "as long again (--more 160s) is predicted to buy +0.7 ± 0.4 dB"
-    assert next_words(POINTS, Gain(0.71, 0.37)) == said
-    assert next_words(POINTS, None) is None
+    said = "as long again (--more 160s) is predicted to gain +0.7 ± 0.4 dB"
+    assert predicted_gain_message(POINTS, PredictedGain(0.71, 0.37)) == said
+    assert predicted_gain_message(POINTS, None) is None
 
 
-def test_what_bought_nothing_has_no_minus() -> None:
+def test_what_gained_nothing_has_no_minus() -> None:
     points = [{"seconds": 10.0 * 2**k, "probe_psnr": 20.0 - 0.01 * k} for k in range(5)]
-    assert "bought +0.0 dB" in (doubling_words(points, None) or "")
+    assert "gained +0.0 dB" in (doubling_message(points, None) or "")
 
 
 @pytest.mark.parametrize(
@@ -34,4 +34,4 @@ def test_what_bought_nothing_has_no_minus() -> None:
 )
 def test_ssim_rises_falls_or_stays(before: float, after: float, words: str):
     points = [{"seconds": 10.0 * (k + 1), "probe_ssim": ssim} for k, ssim in enumerate((before, after))]
-    assert ssim_words(points) == f"SSIM {words} in that doubling"
+    assert ssim_message(points) == f"SSIM {words} in that doubling"

@@ -96,7 +96,7 @@ def test_ignored_alpha_is_like_a_mask(downscale: float, tmp_path: Path, progress
     used = view_mask(inputs["ingest"], opaque, opaque.views[1], downscale)
     assert used is not None and 0 < used.float().mean() < 0.5
     assert dataset.unmasked_count == 6 * used.sum()
-    drawn = dataset.lookup(dataset.nth(torch.arange(dataset.unmasked_count))).colour * 255
+    drawn = dataset.lookup(dataset.unmasked_pixels(torch.arange(dataset.unmasked_count))).colour * 255
     assert torch.equal(drawn, torch.tensor([30.0, 60.0, 200.0]).expand_as(drawn)), "no white of what was cut out"
     assert view_mask(inputs["ingest"], scene, scene.views[1], downscale) is None
 
@@ -121,12 +121,12 @@ def test_cameras_of_test_views_do_not_enter_the_training_dataset(tmp_path: Path,
 
 def test_evaluation_reads_the_pixels_that_training_stored(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path)
-    ingest, trained, unseen = inputs["ingest"], scene.of_split("train")[2], scene.of_split("test")[1]
+    ingest, trained, held_out = inputs["ingest"], scene.of_split("train")[2], scene.of_split("test")[1]
     reader = PhotoReader(ingest, scene, 2.0)
-    decoded = [reader.pixels(view, WHITE) for view in (trained, unseen)]
+    decoded = [reader.pixels(view, WHITE) for view in (trained, held_out)]
     for split in ("train", "test"):
         training_dataset(ingest, scene, split, 2.0, progress)
-    for view, pixels in zip((trained, unseen), decoded, strict=True):
+    for view, pixels in zip((trained, held_out), decoded, strict=True):
         (ingest / view.file).unlink()
         assert torch.equal(reader.pixels(view, WHITE), pixels)
 
@@ -266,12 +266,12 @@ def test_the_bank_knows_where_training_photos_show_points(
 ) -> None:
     inputs, scene = photographed(tmp_path)
     dataset = guided_dataset(inputs, scene, downscale, progress)
-    assert dataset.known is not None and dataset.distance is not None
+    assert dataset.sparse_pixels is not None and dataset.sparse_depths is not None
     seen = seen_points(scene)
     trained = np.array([view.split == "train" for view in scene.views])[seen["view"]]
-    assert len(dataset.known) == trained.sum() > 30
-    rays = dataset.lookup(dataset.known).rays
-    hit = rays.origins + dataset.distance[:, None] * rays.directions
+    assert len(dataset.sparse_pixels) == trained.sum() > 30
+    rays = dataset.lookup(dataset.sparse_pixels).rays
+    hit = rays.origins + dataset.sparse_depths[:, None] * rays.directions
     # Rays run through the middles of pixels, points lie anywhere inside of them.
     half_a_pixel = 0.5 * 2**0.5 * downscale * 3.0 / FOCAL
     closest = torch.cdist(hit, torch.from_numpy(seen["xyz"])).min(-1).values
@@ -290,20 +290,20 @@ def test_points_guide_once_two_training_photos_saw_them(tmp_path: Path, progress
         some = {name: seen[name][rows[:count]] if name in ("view", "point", "xy") else seen[name] for name in seen}
         write_tensors(inputs["normalise"] / "points.safetensors", some)
         dataset = guided_dataset(inputs, scene, 1.0, progress)
-        assert (0 if dataset.known is None else len(dataset.known)) == known
+        assert (0 if dataset.sparse_pixels is None else len(dataset.sparse_pixels)) == known
 
 
 def test_points_on_the_rim_of_alpha_are_no_guide(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=4)
     dataset, opaque = (guided_dataset(inputs, each, 1.0, progress) for each in (scene, replace(scene, has_alpha=False)))
-    assert dataset.known is not None and opaque.known is not None
-    assert (dataset.pixels[dataset.known, 3] == 255).all()
-    assert 0 < len(dataset.known) < len(opaque.known)
+    assert dataset.sparse_pixels is not None and opaque.sparse_pixels is not None
+    assert (dataset.pixels[dataset.sparse_pixels, 3] == 255).all()
+    assert 0 < len(dataset.sparse_pixels) < len(opaque.sparse_pixels)
 
 
 def test_points_on_masked_pixels_are_no_guide(tmp_path: Path, progress: SilentProgress) -> None:
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, WIDTH // 2 :] = 0
     inputs, scene = photographed(tmp_path, mask=mask)
-    known = guided_dataset(inputs, scene, 1.0, progress).known
+    known = guided_dataset(inputs, scene, 1.0, progress).sparse_pixels
     assert known is not None and (known % WIDTH < WIDTH // 2).all()

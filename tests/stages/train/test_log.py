@@ -11,10 +11,10 @@ POINT = {"step": 3, "seconds": 0.5, "train_psnr": 20.0, "probe_psnr": None}
 
 
 def test_events_are_appended_line_by_line_over_restarts(tmp_path: Path) -> None:
-    TrainingLog(tmp_path, tensorboard=False).event("planned", 1, total_steps=9)
+    TrainingLog(tmp_path, tensorboard=False).event("schedule-revised", 1, total_steps=9)
     TrainingLog(tmp_path, tensorboard=False).point(POINT)
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert lines == [{"event": "planned", "step": 1, "total_steps": 9}, {"event": "measured", **POINT}]
+    assert lines == [{"event": "schedule-revised", "step": 1, "total_steps": 9}, {"event": "evaluated", **POINT}]
 
 
 def test_tensorboard_is_asked_for_in_words_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,17 @@ from stages.train.loop import TrainingRun
 from stages.train.state import TrainingBudget
 from stages.train.validation_images import Target
 from tests.refusals import no_note, refused
-from tests.stages.train.one_number import Killed, OneNumber, events, killed_at, number_of, probe, quiet, run_in, unseen
+from tests.stages.train.one_number import (
+    Killed,
+    OneNumber,
+    events,
+    held_out,
+    killed_at,
+    number_of,
+    pixels,
+    quiet,
+    run_in,
+)
 
 
 def test_killed_and_resumed_is_the_same_as_uninterrupted(tmp_path: Path, progress) -> None:
@@ -28,9 +38,9 @@ def test_killed_and_resumed_is_the_same_as_uninterrupted(tmp_path: Path, progres
     resumed.train()
     assert number_of(resumed).history[0][0] == 20, "the resumed run does not start over"
     assert torch.equal(number_of(whole).value, number_of(resumed).value)
-    spent = [(run.state.step, run.state.rays, run.state.samples) for run in (whole, resumed)]
+    spent = [(run.state.step, run.state.rays, run.state.colour_evaluations) for run in (whole, resumed)]
     assert spent == 2 * [(40, 160, 480)]
-    assert "going on from step 20 of 40" in progress.notes
+    assert "resuming from step 20 of 40" in progress.notes
 
 
 def test_finished_and_run_again_does_nothing(tmp_path: Path, progress) -> None:
@@ -74,7 +84,7 @@ def test_after_three_roll_backs_training_fails_by_name(tmp_path: Path, progress)
 
 
 def dying(seeds: int, opacity: float, grey: float) -> Callable[[int], OneNumber]:
-    """A field that is dead with its first ``seeds`` seeds: of some opacity and grey all over."""
+    """A field that has collapsed with its first ``seeds`` seeds: of some opacity and grey all over."""
 
     def make(attempt: int) -> OneNumber:
         field = OneNumber(attempt, quiet)
@@ -86,24 +96,24 @@ def dying(seeds: int, opacity: float, grey: float) -> Callable[[int], OneNumber]
 
 
 @pytest.mark.parametrize(
-    ("opacity", "grey", "symptom"),
+    ("opacity", "grey", "reason"),
     [
         (1e-4, 0.25, "it is empty (mean opacity 1e-04)"),
         (1.0, 0.7, "it is no better than a flat colour (5.8 of 12.0 dB)"),
     ],
 )
-def test_a_dead_field_is_restarted_with_another_seed(
-    opacity: float, grey: float, symptom: str, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+def test_a_collapsed_field_is_restarted_with_another_seed(
+    opacity: float, grey: float, reason: str, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(loop, "WARM_UP_STEPS", 10)
+    monkeypatch.setattr(loop, "MIN_HEALTHY_STEPS", 10)
     run = run_in(tmp_path, progress, make=dying(2, opacity, grey))
     run.train()
     assert (run.state.restarts, run.state.step, number_of(run).seed) == (2, 40, 2)
-    assert progress.notes == [f"after 10 steps the field is dead: {symptom}; starting with another seed"] * 2
+    assert progress.notes == [f"after 10 steps the field has collapsed: {reason}; restarting with another seed"] * 2
 
 
-def test_a_field_that_stays_dead_fails_by_name(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop, "WARM_UP_STEPS", 10)
+def test_a_field_that_stays_collapsed_fails_by_name(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop, "MIN_HEALTHY_STEPS", 10)
     run = run_in(tmp_path, progress, make=dying(9, opacity=0.0, grey=0.5))
     with pytest.raises(StageError) as failure:
         run.train()
@@ -114,12 +124,12 @@ def test_a_field_that_stays_dead_fails_by_name(tmp_path: Path, progress, monkeyp
 def test_the_curve_ends_with_the_run_and_is_on_record(
     tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(loop.FIRST_MEASUREMENT, "steps", 10.0)
+    monkeypatch.setitem(loop.FIRST_EVALUATION, "steps", 10.0)
     run = run_in(tmp_path, progress)
     run.train()
     assert run.state.curve[-1]["step"] == 40
     assert run.state.curve[-1]["probe_psnr"] == 20.0
-    measured = [e for e in events(tmp_path) if e["event"] == "measured"]
+    measured = [e for e in events(tmp_path) if e["event"] == "evaluated"]
     assert [e["step"] for e in measured] == [point["step"] for point in run.state.curve]
     assert [point["step"] for point in run.state.curve] == [10, 15, 21, 29, 40]
     assert {"device", "threads"} & set(run.state.curve[0]) == set() and run.state.curve[0]["probe_ssim"] is None
@@ -128,7 +138,7 @@ def test_the_curve_ends_with_the_run_and_is_on_record(
 def test_what_was_measured_of_steps_taken_back_is_forgotten(
     tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(loop.FIRST_MEASUREMENT, "steps", 10.0)
+    monkeypatch.setitem(loop.FIRST_EVALUATION, "steps", 10.0)
 
     def trouble(step: int, lr_scale: float) -> None:
         if step == 22 and lr_scale == 1:
@@ -144,15 +154,15 @@ def test_what_was_measured_of_steps_taken_back_is_forgotten(
 def test_a_field_improved_by_more_steps_is_of_use(tmp_path: Path, progress) -> None:
     first = run_in(tmp_path / "first", progress, make=dying(1, 0.0, 0.5))
     first.train()
-    assert first.state.symptom == "it is empty (mean opacity 0e+00)"
+    assert first.state.failure_reason == "it is empty (mean opacity 0e+00)"
     more = run_in(tmp_path / "more", progress, TrainingBudget(20, None, tmp_path / "first"))
     more.train()
-    assert more.state.symptom is None
+    assert more.state.failure_reason is None
 
 
 def test_the_live_line_tells_step_speed_quality_and_time_left(tmp_path: Path, progress) -> None:
     run = run_in(tmp_path, progress)
-    assert run._describe() == ("first step", 0.0)
+    assert run._progress_line() == ("first step", 0.0)
     run.train()
     message, done = progress.updates[-1]
     assert message.startswith("step 40 · ") and message.endswith(
@@ -184,7 +194,7 @@ def test_more_steps_begin_at_the_longer_runs_rates(tmp_path: Path, progress) -> 
     curve = [point["step"] for point in longer.state.curve]
     assert curve == sorted(set(curve)) and curve[-1] == 60 and 40 in curve, "one curve over both"
     assert before == {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
-    assert "going on from the 40 steps of the finished training, in 60" in progress.notes
+    assert "continuing the finished training from step 40 to step 60" in progress.notes
 
 
 def test_more_steps_in_two_pieces_are_the_same_bytes(tmp_path: Path, progress) -> None:
@@ -220,7 +230,7 @@ class Rising(OneNumber):
     def step(self, step: int, progress: float, lr_scale: float) -> StepResult:
         result = super().step(step, progress, lr_scale)
         db = 20 + math.log2((step + 1) / 500) + self.annealing * progress
-        self.shown = probe().colours + 10 ** (-db / 20)
+        self.shown = pixels().colours + 10 ** (-db / 20)
         return result
 
 
@@ -231,13 +241,13 @@ class RisingLess(Rising):
 
 
 def towards(folder: Path, progress, target: float, make=Rising, steps: int = 1000) -> TrainingRun:
-    run = run_in(folder, progress, TrainingBudget(steps, None), lambda attempt: make(), Target(target, unseen()))
+    run = run_in(folder, progress, TrainingBudget(steps, None), lambda attempt: make(), Target(target, held_out()))
     run.train()
     return run
 
 
 def reasons(run: TrainingRun) -> list[str]:
-    return [decision.reason for decision in run.plan.decisions]
+    return [decision.reason for decision in run.schedule.revisions]
 
 
 def test_a_target_ends_the_run_once_it_is_reached(tmp_path: Path, progress) -> None:
@@ -245,7 +255,7 @@ def test_a_target_ends_the_run_once_it_is_reached(tmp_path: Path, progress) -> N
     assert run.state.validation_psnr is not None and 20.0 <= run.state.validation_psnr < 20.3
     assert 200 < run.state.step < 400, "annealing gave the last of it"
     assert reasons(run) == ["begin", "target", "target"]
-    assert run.plan.total_steps == run.state.step == run.state.curve[-1]["step"]
+    assert run.schedule.total_steps == run.state.step == run.state.curve[-1]["step"]
 
 
 def test_an_unreachable_target_takes_the_whole_budget(tmp_path: Path, progress) -> None:
@@ -258,12 +268,12 @@ def test_annealing_that_does_not_suffice_is_undone(tmp_path: Path, progress) -> 
     run = towards(tmp_path, progress, 20.0, RisingLess)
     assert reasons(run)[:3] == ["begin", "target", "more"]
     assert run.state.validation_psnr is not None and 20.0 <= run.state.validation_psnr < 20.3
-    back = run.plan.decisions[2]
+    back = run.schedule.revisions[2]
     assert (back.total_steps, back.progress) == (1000, back.from_step / 1000)
 
 
 def more_towards(folder: Path, progress, target: float, first: Path, make=Rising) -> TrainingRun:
-    run = run_in(folder, progress, TrainingBudget(600, None, first), lambda attempt: make(), Target(target, unseen()))
+    run = run_in(folder, progress, TrainingBudget(600, None, first), lambda attempt: make(), Target(target, held_out()))
     run.train()
     return run
 
@@ -279,17 +289,17 @@ def test_a_target_that_was_reached_does_not_end_more_steps(tmp_path: Path, progr
     with pytest.raises(Killed):
         more_towards(tmp_path / "more", progress, 20.0, tmp_path / "first", Mortal)
     more = more_towards(tmp_path / "more", progress, 20.0, tmp_path / "first")
-    assert more.state.step == first.state.step + 600 and more.plan.progress(more.state.step) == pytest.approx(1)
+    assert more.state.step == first.state.step + 600 and more.schedule.progress(more.state.step) == pytest.approx(1)
     assert reasons(more) == [*reasons(first), "more"]
-    assert progress.notes.count("20 dB are reached already: training goes on for all that was asked for") == 1
-    assert more.state.open_target(20.0) is None and first.state.open_target(20.0) == 20.0
+    assert progress.notes.count("20 dB are reached already: training uses the whole additional budget") == 1
+    assert more.state.pending_target(20.0) is None and first.state.pending_target(20.0) == 20.0
 
 
 def test_a_higher_target_anneals_as_if_new(tmp_path: Path, progress) -> None:
     first = towards(tmp_path / "first", progress, 20.0)
     more = more_towards(tmp_path / "more", progress, 20.8, tmp_path / "first")
     assert more.state.validation_psnr is not None and 20.8 <= more.state.validation_psnr < 21.1
-    closing = more.plan.decisions[len(first.plan.decisions) + 1]
+    closing = more.schedule.revisions[len(first.schedule.revisions) + 1]
     seen = {e["step"]: e["psnr"] for e in events(tmp_path / "more") if e["event"] == "validated"}
     assert closing.reason == "target" and 19.8 <= seen[closing.from_step] < 20.3, "within 1 dB, not a part of that"
 
@@ -306,6 +316,6 @@ def test_a_target_run_in_two_pieces_is_the_same(at: int, tmp_path: Path, progres
     with pytest.raises(Killed):
         towards(tmp_path / "cut", progress, 20.0, Mortal)
     resumed = towards(tmp_path / "cut", progress, 20.0)
-    assert resumed.plan == whole.plan
+    assert resumed.schedule == whole.schedule
     assert torch.equal(number_of(whole).value, number_of(resumed).value)
     assert [p["step"] for p in resumed.state.curve] == [p["step"] for p in whole.state.curve]

@@ -11,7 +11,7 @@ import pytest
 from stages.train import loop
 from stages.train.checkpoints import latest_checkpoint
 from stages.train.loop import TrainingRun
-from stages.train.state import Pace, TrainingBudget, checkpoint_interval
+from stages.train.state import TrainingBudget, TrainingSpeed, checkpoint_interval
 from tests.refusals import no_note
 from tests.stages.train.one_number import Killed, OneNumber, killed_at, number_of, run_in, slow
 
@@ -20,8 +20,8 @@ def test_a_run_in_seconds_ends_at_full_progress(tmp_path: Path, progress) -> Non
     run = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
     run.train()
     assert 0.2 < run.state.seconds < 0.5
-    assert run.plan.progress(run.state.step) == pytest.approx(1)
-    assert len(run.plan.decisions) >= 2
+    assert run.schedule.progress(run.state.step) == pytest.approx(1)
+    assert len(run.schedule.revisions) >= 2
     shares = [share for _, share, _ in number_of(run).history]
     assert 0.8 < shares[-1] < 1
 
@@ -29,13 +29,13 @@ def test_a_run_in_seconds_ends_at_full_progress(tmp_path: Path, progress) -> Non
 def test_a_resumed_run_in_seconds_keeps_its_clock(tmp_path: Path, progress) -> None:
     with pytest.raises(Killed):
         run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=killed_at(30)).train()
-    journal = json.loads((tmp_path / "plan.json").read_text())
+    journal = json.loads((tmp_path / "schedule.json").read_text())
     resumed = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
     resumed.train()
-    assert [list(decision) for decision in resumed.plan.decisions][: len(journal)] == journal
-    assert number_of(resumed).history[0][:2] == (30, resumed.plan.progress(30))
+    assert [list(decision) for decision in resumed.schedule.revisions][: len(journal)] == journal
+    assert number_of(resumed).history[0][:2] == (30, resumed.schedule.progress(30))
     assert 0.2 < resumed.state.seconds < 0.5
-    assert any(note.startswith("going on from step 30, with 0 s of training left") for note in progress.notes)
+    assert any(note.startswith("resuming from step 30, with 0 s of training left") for note in progress.notes)
 
 
 def test_more_seconds_take_about_that_long(tmp_path: Path, progress) -> None:
@@ -45,7 +45,7 @@ def test_more_seconds_take_about_that_long(tmp_path: Path, progress) -> None:
     first = run_in(tmp_path / "first", progress, TrainingBudget(None, 0.2), make)
     first.train()
     more = run_in(tmp_path / "more", progress, TrainingBudget(None, 0.2, tmp_path / "first"), make)
-    assert more.plan.progress(first.state.step) == pytest.approx(0.5, abs=0.05)
+    assert more.schedule.progress(first.state.step) == pytest.approx(0.5, abs=0.05)
     more.train()
     assert 0.1 < more.state.seconds - first.state.seconds < 0.35
 
@@ -96,7 +96,7 @@ def test_what_a_kill_loses_is_spent(
     assert 29 + again == pytest.approx(60, abs=2.5), "it is all spent, however slow the machine is now"
     shares = [share for _, share, _ in number_of(run).history]
     assert shares == sorted(shares) and 0.9 < shares[-1] <= 1
-    lost = [note for note in progress.notes if "after the last checkpoint are lost, and count as spent" in note]
+    lost = [note for note in progress.notes if "after the last checkpoint are lost and count as spent" in note]
     assert len(lost) == (29 - checkpoint.facts["seconds"] > 1.6)
 
 
@@ -123,7 +123,7 @@ def test_what_was_spent_may_be_unreadable(
     on_clock = (tmp_path, progress, monkeypatch, 60.0, lambda _: 0.2)
     with pytest.raises(Killed):
         run_on_a_made_up_clock(*on_clock, 10.0)
-    (tmp_path / "spent.txt").write_text(content)
+    (tmp_path / "elapsed.txt").write_text(content)
     assert run_on_a_made_up_clock(*on_clock).state.seconds == pytest.approx(60, abs=0.7)
 
 
@@ -161,9 +161,9 @@ def test_a_machine_that_changes_its_speed_is_followed(
 
 
 def test_the_pace_forgets_first_steps_and_stalls() -> None:
-    pace = Pace()
-    pace.add(1.0, 4, 20.0)
-    assert pace.seconds_per_step == 1.0
+    speed = TrainingSpeed()
+    speed.add(1.0, 4, 20.0)
+    assert speed.seconds_per_step == 1.0
     for seconds in (0.04, 0.04, 0.04, 30.0):
-        pace.add(seconds, 4, 20.0)
-    assert pace.seconds_per_step == pytest.approx(0.06)
+        speed.add(seconds, 4, 20.0)
+    assert speed.seconds_per_step == pytest.approx(0.06)

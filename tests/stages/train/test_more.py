@@ -10,6 +10,7 @@ from nerf.geometry.scene import Camera, Scene
 from stages import train
 from stages.io.files import read_json, write_json
 from stages.train import Config
+from stages.train.fields.vanilla_options import VanillaOptions
 from stages.train.more import training_name
 from stages.train.planning import larger_photos_words
 from tests.stages.photo_scene import photographed
@@ -18,7 +19,7 @@ DIGEST = "d" * 64
 NAME = training_name("k" * 64, DIGEST)
 
 
-FIELD: dict[str, Any] = {"field": "paper", "batch_rays": 3000}
+FIELD: dict[str, Any] = {"field": "vanilla", "vanilla": VanillaOptions(batch_rays=3000)}
 
 
 @pytest.fixture
@@ -55,10 +56,10 @@ def words(inputs: dict[str, Path], **more: Any) -> str | None:
 
 def test_photos_larger_by_a_fifth_are_named(inputs: dict[str, Path]) -> None:
     stay = "photos stay at 1/2 of their size and the field as large as it is"
-    anew = "4 min from the start would have them at 1/1: --train.seconds 240, or a larger --budget, trains anew"
-    assert words(inputs, more_seconds=180.0) == f"{stay}; {anew}"
-    anew = "2,000 steps from the start would have them at 1/1.4: --train.steps 2000 trains anew"
-    assert words(inputs, more_steps=1000) == f"{stay}; {anew}"
+    advice = "4 min from the start would have them at 1/1: --train.seconds 240, or a larger --budget, trains anew"
+    assert words(inputs, more_seconds=180.0) == f"{stay}; {advice}"
+    advice = "2,000 steps from the start would have them at 1/1.4: --train.steps 2000 trains anew"
+    assert words(inputs, more_steps=1000) == f"{stay}; {advice}"
 
 
 def test_a_little_more_is_worth_no_word(inputs: dict[str, Path]) -> None:

@@ -22,7 +22,7 @@ def older_facts(folder: Path) -> None:
 
 
 def older_plan(folder: Path) -> None:
-    (folder / "plan.json").write_text(json.dumps([[0, 40, 0.0, "begin", "of another version"]]))
+    (folder / "schedule.json").write_text(json.dumps([[0, 40, 0.0, "begin", "of another version"]]))
 
 
 def damaged(folder: Path) -> None:
@@ -44,5 +44,5 @@ def test_more_is_refused_in_words(
     first = tmp_path / "first"
     run_in(first, progress).train()
     change(first)
-    with pytest.raises(StageError, match=f"training cannot go on: .*{why}"):
+    with pytest.raises(StageError, match=f"cannot continue training: .*{why}"):
         run_in(tmp_path / "more", progress, TrainingBudget(more, None, first))

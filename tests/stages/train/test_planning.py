@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -12,15 +13,17 @@ from stages.contract import Progress
 from stages.effects.decisions import Decisions
 from stages.train import Config
 from stages.train.data import MIN_LONG_SIDE, has_background_model, scaled_size
-from stages.train.fields import with_defaults
+from stages.train.fields.field_list import with_defaults
 from stages.train.fields.hash_grid import (
     LARGE_STEP_LEARNING_RATE,
     MAX_STEP_SAMPLES,
-    PART_SAMPLES,
+    MICRO_BATCH_SAMPLES,
     field_settings,
     memory_bytes,
     with_sizes,
 )
+from stages.train.fields.hash_grid_options import HashGridOptions
+from stages.train.fields.vanilla_options import VanillaOptions
 from stages.train.planning import MAX_PHOTOS, MAX_PIXELS, chosen_downscale, rays_in_budget, rays_per_second, reason
 from tests.stages.photo_scene import photographed
 
@@ -83,33 +86,28 @@ def test_redundant_photos_are_not_reduced_endlessly(scene: Scene) -> None:
 
 
 GRID = Config(
-    field="grid",
-    backend="warp",
-    chunks=1,
     steps=100,
     contracted=False,
     view_dependence=True,
-    batch_samples=4096,
     learning_rate=1e-2,
     background="random",
+    grid=HashGridOptions(backend="warp", micro_batches=1, target_samples=4096),
 )
-PAPER = Config(
-    field="paper",
+VANILLA = Config(
     seconds=10.0,
-    depth=1,
-    width=8,
-    skip=1,
-    samples_coarse=2,
-    samples_fine=2,
     contracted=False,
     view_dependence=True,
-    spacing="linear",
-    batch_rays=64,
     learning_rate=5e-3,
+    vanilla=VanillaOptions(depth=1, width=8, skip=1, samples_coarse=2, samples_fine=2, spacing="linear", batch_rays=64),
 )
 
 
-@pytest.mark.parametrize("config", [GRID, PAPER], ids=["grid", "paper"])
+def with_grid(config: Config, **options: Any) -> Config:
+    """``config`` with these options of the hash-grid field."""
+    return config.model_copy(update={"grid": config.grid.model_copy(update=options)})
+
+
+@pytest.mark.parametrize("config", [GRID, VANILLA], ids=["grid", "vanilla"])
 def test_the_speed_is_measured_on_this_machine(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stages.train.planning.TIMED_SECONDS", 0.05)
     _, scene = photographed(tmp_path, channels=4)
@@ -117,7 +115,7 @@ def test_the_speed_is_measured_on_this_machine(config: Config, tmp_path: Path, m
 
 
 def test_a_budget_of_steps_is_counted_not_timed(scene: Scene) -> None:
-    assert rays_in_budget(PAPER.model_copy(update={"steps": 5, "seconds": None}), scene, Decisions()) == 5 * 64
+    assert rays_in_budget(VANILLA.model_copy(update={"steps": 5, "seconds": None}), scene, Decisions()) == 5 * 64
     spaces = [GRID.model_copy(update={"contracted": contracted}) for contracted in (False, True)]
     in_box, folded = (rays_in_budget(config, scene, Decisions()) for config in spaces)
     assert 100 * 4096 / 100 < folded < in_box < 100 * 4096
@@ -125,8 +123,11 @@ def test_a_budget_of_steps_is_counted_not_timed(scene: Scene) -> None:
 
 def sizes_of(config: Config, scene: Scene, rays: float, progress: Progress | None = None) -> dict[str, int]:
     """What is chosen where ``config`` leaves sizes open."""
-    sized = with_sizes(config, scene, rays, progress).model_dump()
-    return {name: sized[name] for name in ("levels", "log2_rows", "finest")}
+    return sizes_in(with_sizes(config, scene, rays, progress).grid)
+
+
+def sizes_in(grid: HashGridOptions) -> dict[str, int]:
+    return grid.model_dump(include={"num_levels", "log2_hashmap_size", "max_res"})
 
 
 @given(st.floats(1e3, 1e9), st.floats(1, 100), st.floats(1, 20), st.booleans())
@@ -138,7 +139,7 @@ def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: floa
 
     small, more_rays, fewer_pixels = chosen(rays, down), chosen(rays * factor, down), chosen(rays, down * factor)
     assert all(more_rays[name] >= small[name] >= fewer_pixels[name] for name in small)
-    field = field_settings(config.model_copy(update=small), sky=False)
+    field = field_settings(with_grid(config, **small), sky=False)
     assert isinstance(field, HashGridSettings)
     assert 128 <= field.max_res <= 1024
     # Two neighbouring samples lie in the same or in neighbouring cells of the finest grid, near the cameras at least.
@@ -153,48 +154,50 @@ def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: floa
 def test_a_gpu_has_larger_fields_and_takes_larger_steps(
     scene: Scene, folded: bool, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = Config(field="grid", contracted=folded, view_dependence=True, downscale=1.0, chunks=2)
+    grid = HashGridOptions(micro_batches=2)
+    config = Config(grid=grid, contracted=folded, view_dependence=True, downscale=1.0)
     large = of_size(scene, 4000, 3000)
     on_cpu = sizes_of(with_defaults(config), large, 1e9), with_defaults(config)
     monkeypatch.setattr("stages.train.fields.hash_grid.compute_device", lambda: "cuda")
     monkeypatch.setattr("stages.train.fields.hash_grid.available_on", {"cuda": 80e9}.get)
     on_gpu = sizes_of(with_defaults(config), large, 1e9), with_defaults(config)
-    assert on_gpu[0] == {"levels": 8, "log2_rows": 20, "finest": most}
-    assert on_gpu[0]["finest"] > on_cpu[0]["finest"] and on_gpu[0]["log2_rows"] > on_cpu[0]["log2_rows"]
+    assert on_gpu[0] == {"num_levels": 8, "log2_hashmap_size": 20, "max_res": most}
+    assert all(on_gpu[0][name] > on_cpu[0][name] for name in ("max_res", "log2_hashmap_size"))
     assert sizes_of(with_defaults(config), large, 1e6) == {
-        "levels": 5 if folded else 4,
-        "log2_rows": 17,
-        "finest": 512 // (2 - folded),
+        "num_levels": 5 if folded else 4,
+        "log2_hashmap_size": 17,
+        "max_res": 512 // (2 - folded),
     }
-    assert (on_gpu[1].batch_samples, on_gpu[1].learning_rate) == (1 << 18, 2e-2)
-    assert (on_cpu[1].batch_samples or 0) < 1 << 16
-    few = with_defaults(config.model_copy(update={"batch_samples": 1 << 14}))
+    assert (on_gpu[1].grid.target_samples, on_gpu[1].learning_rate) == (1 << 18, 2e-2)
+    assert (on_cpu[1].grid.target_samples or 0) < 1 << 16
+    few = with_defaults(with_grid(config, target_samples=1 << 14))
     assert few.learning_rate == (1e-2 if folded else 2e-2)
 
 
 @pytest.mark.parametrize("folded", [True, False])
 def test_every_core_has_an_equal_part(folded: bool) -> None:
-    parts = [with_defaults(Config(contracted=folded, chunks=chunks)) for chunks in (1, 2, 64)]
-    sizes = [part.batch_samples or 0 for part in parts]
-    assert sizes == [PART_SAMPLES[parts[0].space], 2 * sizes[0], MAX_STEP_SAMPLES]
+    parts = [with_defaults(with_grid(Config(contracted=folded), micro_batches=count)) for count in (1, 2, 64)]
+    sizes = [part.grid.target_samples or 0 for part in parts]
+    assert sizes == [MICRO_BATCH_SAMPLES[parts[0].space], 2 * sizes[0], MAX_STEP_SAMPLES]
     assert parts[2].learning_rate == LARGE_STEP_LEARNING_RATE >= (parts[1].learning_rate or 1)
 
 
 def test_samples_follow_occupied_cells() -> None:
-    folded = Config(contracted=True, view_dependence=True, levels=1, log2_rows=8)
-    sizes = {finest: folded.model_copy(update={"finest": finest}) for finest in (256, 512, 700, 1024, 2048, 4096)}
-    fields = {finest: field_settings(config, sky=False) for finest, config in sizes.items()}
-    steps = [field.min_step_size for field in fields.values()]
+    folded = Config(contracted=True, view_dependence=True, grid=HashGridOptions(num_levels=1, log2_hashmap_size=8))
+    sizes = (with_grid(folded, max_res=max_res) for max_res in (256, 512, 700, 1024, 2048, 4096))
+    fields = [field_settings(config, sky=False) for config in sizes]
+    steps = [field.min_step_size for field in fields]
     assert steps == [4 / 768, 4 / 1536, 4 / 1536, 4 / 1536, 4 / 3072, 4 / 3072]
-    assert all(field.cone_angle == field.min_step_size / 0.25 for field in fields.values())
+    assert all(field.cone_angle == field.min_step_size / 0.25 for field in fields)
 
 
 @pytest.mark.parametrize("contracted", [False, True])
 @given(factor=st.floats(0.25, 4.0))
 def test_ray_samples_multiply_the_samples_along_a_ray(contracted: bool, factor: float) -> None:
-    sizes = {"levels": 4, "log2_rows": 16, "finest": 512, "contracted": contracted}
-    usual = field_settings(GRID.model_copy(update=sizes), sky=False)
-    asked = field_settings(GRID.model_copy(update=sizes | {"ray_samples": factor}), sky=False)
+    config = with_grid(GRID, num_levels=4, log2_hashmap_size=16, max_res=512)
+    config = config.model_copy(update={"contracted": contracted})
+    usual = field_settings(config, sky=False)
+    asked = field_settings(with_grid(config, ray_samples=factor), sky=False)
     assert asked.diagonal_steps == pytest.approx(factor * usual.diagonal_steps, abs=0.5)
     assert asked.cone_angle == pytest.approx(usual.cone_angle / factor)
     assert asked.stepping.step_size == pytest.approx(usual.stepping.step_size / factor, rel=0.01)
@@ -212,15 +215,15 @@ def test_unbounded_space_without_alpha_has_a_background(scene: Scene, contracted
 def test_the_reason_for_sizes_is_the_budget() -> None:
     said = "100 steps draw about 1.0 M rays and compute 3.0 M colours: sizes left open are chosen for that"
     assert reason(GRID, 1e6) == said
-    assert reason(PAPER, 950) == "10 s on this machine draw about 950 rays: sizes left open are chosen for that"
+    assert reason(VANILLA, 950) == "10 s on this machine draw about 950 rays: sizes left open are chosen for that"
 
 
 FOLDED = GRID.model_copy(update={"contracted": True, "downscale": 1.0})
 LARGEST, SMALLEST = (
-    {"levels": levels, "log2_rows": log2_rows, "finest": finest}
-    for levels, log2_rows, finest in ((6, 18, 1024), (5, 17, 512))
+    {"num_levels": levels, "log2_hashmap_size": log2_size, "max_res": max_res}
+    for levels, log2_size, max_res in ((6, 18, 1024), (5, 17, 512))
 )
-NEEDED = memory_bytes(FOLDED.model_copy(update=LARGEST), 1)
+NEEDED = memory_bytes(with_grid(FOLDED, **LARGEST), 1)
 
 
 @pytest.mark.parametrize(
@@ -229,16 +232,16 @@ NEEDED = memory_bytes(FOLDED.model_copy(update=LARGEST), 1)
         (2 * NEEDED, {}, LARGEST),
         (2 * NEEDED - 1, {}, SMALLEST),
         (0.0, {}, SMALLEST),
-        (2 * NEEDED, {"log2_rows": 20}, SMALLEST),
+        (2 * NEEDED, {"log2_hashmap_size": 20}, SMALLEST),
     ],
 )
 def test_grids_take_half_of_the_free_memory_at_most(
     scene: Scene, free: float, own: dict[str, int], chosen: dict[str, int], monkeypatch: pytest.MonkeyPatch, progress
 ) -> None:
     monkeypatch.setattr("stages.train.fields.hash_grid.available_on", {"cpu": free}.get)
-    config = FOLDED.model_copy(update=own)
+    config = with_grid(FOLDED, **own)
     assert sizes_of(config, of_size(scene, 4000, 3000), 1e9, progress) == chosen | own
-    said = "5 grids of up to 2^{log2_rows} rows: 6 grids of up to 2^18 rows, which the budget could fill, take "
+    said = "5 grids of up to 2^{log2_hashmap_size} rows: 6 grids of up to 2^18 rows, which the budget could fill, take "
     assert [note.startswith(said.format(**chosen)) for note in progress.notes] == [True] * (chosen is not LARGEST)
 
 

@@ -6,17 +6,21 @@ from typing import Any
 import pytest
 import torch
 
-from nerf.runtime.matmul_precision import Medium
+from nerf.runtime.matmul_precision import MediumPrecision
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from stages import train
 from stages.effects.decisions import Decisions
 from stages.train import Config
+from stages.train.fields.vanilla_options import VanillaOptions
 from stages.train.planning import rays_per_second
 from stages.train.precision import chosen_precision
 from tests.stages.photo_scene import photographed
 
-TINY: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024, "downscale": 1.0}
-FAST, INEXACT, NOTHING = Medium(2.53, 1.2e-5), Medium(4.0, 3e-4), Medium(1.0, 2e-7)
+TINY: dict[str, Any] = {
+    "grid": {"num_levels": 2, "log2_hashmap_size": 10, "max_res": 32, "target_samples": 1024},
+    "downscale": 1.0,
+}
+FAST, INEXACT, NOTHING = MediumPrecision(2.53, 1.2e-5), MediumPrecision(4.0, 3e-4), MediumPrecision(1.0, 2e-7)
 SAID = "matrix products at torch's precision medium: 2.5 times faster here, off by 1e-05"
 
 
@@ -25,8 +29,8 @@ def here(monkeypatch: pytest.MonkeyPatch):
     """Sets what "medium" is on this machine; the widths that it was asked for."""
     widths: list[int] = []
 
-    def is_(medium: Medium) -> list[int]:
-        def measured(device: torch.device, width: int) -> Medium:
+    def is_(medium: MediumPrecision) -> list[int]:
+        def measured(device: torch.device, width: int) -> MediumPrecision:
             widths.append(width)
             return medium
 
@@ -52,10 +56,12 @@ def trained_at(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 @pytest.mark.parametrize(
     "medium, chosen, notes", [(FAST, "medium", [SAID]), (INEXACT, "highest", []), (NOTHING, "highest", [])]
 )
-def test_a_run_in_seconds_takes_what_pays(medium: Medium, chosen: str, notes: list[str], here, progress) -> None:
+def test_a_run_in_seconds_takes_what_pays(
+    medium: MediumPrecision, chosen: str, notes: list[str], here, progress
+) -> None:
     widths = here(medium)
     assert chosen_precision(Config(seconds=5, field="grid"), progress) == chosen
-    assert chosen_precision(Config(seconds=5, field="paper", width=48), progress) == chosen
+    assert chosen_precision(Config(seconds=5, vanilla=VanillaOptions(width=48)), progress) == chosen
     assert progress.notes == 2 * notes and widths == [64, 48]
 
 

@@ -17,26 +17,29 @@ from stages.io.field_files import load_field
 from stages.io.files import read_json
 from stages.io.photos import Photo, write_photos
 from stages.train import Config
-from stages.train.config import GRID_ONLY, PAPER_ONLY
+from stages.train.config import FIELD_NAMES, OPTIONS_OF_FIELD, FieldName
 from stages.train.data import training_dataset
 from stages.train.fields.hash_grid import LEARNING_RATES
+from stages.train.fields.hash_grid_options import HashGridOptions
+from stages.train.fields.vanilla_options import VanillaOptions
 from stages.train.training import prepare
-from stages.train.validation_images import unseen_photos, with_validation
+from stages.train.validation_images import held_out_evaluation, with_validation_split
 from tests.refusals import refused
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 
-TINY: dict[str, Any] = {
-    "depth": 2,
-    "width": 16,
-    "samples_coarse": 8,
-    "samples_fine": 8,
-    "position_frequencies": 4,
-    "batch_rays": 64,
-    "downscale": 1.0,
-    "learning_rate": 5e-3,
+TINY: dict[FieldName, dict[str, Any]] = {
+    "grid": {"num_levels": 2, "log2_hashmap_size": 10, "max_res": 32, "target_samples": 1024},
+    "vanilla": {
+        "depth": 2,
+        "width": 16,
+        "samples_coarse": 8,
+        "samples_fine": 8,
+        "position_frequencies": 4,
+        "batch_rays": 64,
+    },
 }
-TINY_GRID: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024, "downscale": 1.0}
-TRAINERS = {"grid": HashGridTrainer, "paper": VanillaTrainer}
+TRAINERS: dict[FieldName, Any] = {"grid": HashGridTrainer, "vanilla": VanillaTrainer}
+ABLATIONS: list[dict[str, Any]] = [{"vanilla": {"positional_encoding": False}}, {"vanilla": {"hierarchical": False}}]
 OUTPUTS = ("field.safetensors", "field.json")
 
 
@@ -44,10 +47,15 @@ class Killed(BaseException):
     """Stands for kill -9."""
 
 
-def trained(folder: Path, inputs: dict[str, Path], progress, **settings):
+def tiny(field: FieldName = "vanilla", **settings: Any) -> Config:
+    """A small field: ``settings`` of the stage, and of the field under its name."""
+    options: dict[str, Any] = {"downscale": 1.0, "learning_rate": 5e-3 if field == "vanilla" else None} | settings
+    return Config(**options | {"field": field, field: TINY[field] | settings.get(field, {})})
+
+
+def trained(folder: Path, inputs: dict[str, Path], progress, field: FieldName = "vanilla", **settings):
     folder.mkdir(exist_ok=True)
-    tiny = TINY_GRID if settings.get("field") == "grid" else TINY
-    return train.run(Config(**(tiny | settings)), inputs, folder, progress)
+    return train.run(tiny(field, **settings), inputs, folder, progress)
 
 
 def test_photos_become_a_field_that_beats_a_flat_colour(tmp_path: Path, progress) -> None:
@@ -67,38 +75,38 @@ def test_photos_become_a_field_that_beats_a_flat_colour(tmp_path: Path, progress
     assert [point["step"] for point in curve["points"]] == [64, 91, 120]
     assert set(last) == {"step", "seconds", "train_psnr", "probe_psnr", "probe_ssim"}
     assert curve["points"][0]["probe_ssim"] < last["probe_ssim"] < 1
-    assert progress.notes[0] == "paper field (2 × 16), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels"
+    assert progress.notes[0] == "vanilla field (2 × 16), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels"
 
 
 def test_the_grid_field_trains_from_photos_too(tmp_path: Path, progress) -> None:
     inputs, _ = photographed(tmp_path, channels=4)
-    result = trained(tmp_path / "train", inputs, progress, field="grid", chunks=2, steps=120)
+    result = trained(tmp_path / "train", inputs, progress, field="grid", steps=120, grid={"micro_batches": 2})
     flat = 11.0  # dB, of the best single colour
     assert flat + 2 < result.facts["probe_psnr"] < 60
     _, info = load_field(tmp_path / "train")
     assert (info["kind"], info["background"], result.facts["field"]) == ("grid", [1, 1, 1], "grid")
     assert (info["settings"]["num_levels"], info["settings"]["max_res"]) == (2, 32)
     assert 120 * 8 < info["rays"] < 120 * 8192
-    colours = result.facts["samples_per_second"] / result.facts["rays_per_second"]
+    colours = result.facts["colours_per_second"] / result.facts["rays_per_second"]
     assert 0.5 < colours < 100, "of a ray"
     assert progress.notes[:2] == [
         "grid field (2 grids of up to 2^10 rows, to 32³), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels",
-        "1,024 colours a step in 2 parts, by warp · samples every 0.057 scene units",
+        "1,024 colours a step in 2 micro-batches, by warp · samples every 0.057 scene units",
     ]
 
 
 def test_that_samples_stand_farther_apart_with_distance_is_said(tmp_path: Path, progress) -> None:
     inputs, _ = photographed(tmp_path, bounded=False)
-    trained(tmp_path / "train", inputs, progress, field="grid", chunks=1, backend="torch", steps=1)
+    trained(tmp_path / "train", inputs, progress, field="grid", steps=1, grid={"micro_batches": 1, "backend": "torch"})
     assert progress.notes[1] == (
-        "1,024 colours a step in 1 part, by torch · samples every 0.042 scene units, "
+        "1,024 colours a step in 1 micro-batch, by torch · samples every 0.042 scene units, "
         "from 0.25 on every 16.7% of the distance"
     )
 
 
 @pytest.mark.parametrize("field", TRAINERS)
 def test_forty_steps_are_twenty_a_kill_and_twenty_more(
-    field: str, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+    field: FieldName, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inputs, _ = photographed(tmp_path, channels=4)
     settings = {"field": field, "steps": 40, "background": "random", "checkpoint_seconds": 1e-9}
@@ -117,7 +125,7 @@ def test_forty_steps_are_twenty_a_kill_and_twenty_more(
             trained(tmp_path / "cut", inputs, progress, **settings)
     assert not (tmp_path / "cut" / "field.json").exists()
     trained(tmp_path / "cut", inputs, progress, **settings)
-    assert "going on from step 20 of 40" in progress.notes
+    assert "resuming from step 20 of 40" in progress.notes
     for name in OUTPUTS:
         assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     final = "checkpoints/000000040.safetensors"  # the optimiser, too
@@ -144,7 +152,7 @@ def test_a_grid_field_that_diverges_is_rolled_back(tmp_path: Path, progress, mon
 
 def test_an_empty_hash_grid_field_is_given_up(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs, _ = photographed(tmp_path, channels=4)
-    monkeypatch.setattr("stages.train.loop.WARM_UP_STEPS", 3)
+    monkeypatch.setattr("stages.train.loop.MIN_HEALTHY_STEPS", 3)
     monkeypatch.setattr("nerf.fields.mlp.sigma_of", lambda geometry: 0 * geometry[:, 0])
     with refused("train.collapsed", "after 3 steps", "empty", "3 different seeds"):
         trained(tmp_path / "train", inputs, progress, field="grid", steps=20)
@@ -157,12 +165,13 @@ def test_another_seed_is_another_field(tmp_path: Path, progress) -> None:
     assert (tmp_path / "0" / OUTPUTS[0]).read_bytes() != (tmp_path / "1" / OUTPUTS[0]).read_bytes()
 
 
-@pytest.mark.parametrize("ablation", ["view_dependence", "positional_encoding", "hierarchical"])
-def test_every_ablation_trains_and_comes_back(ablation: str, tmp_path: Path, progress) -> None:
+@pytest.mark.parametrize("ablation", [{"view_dependence": False}, *ABLATIONS])
+def test_every_ablation_trains_and_comes_back(ablation: dict[str, Any], tmp_path: Path, progress) -> None:
     inputs, _ = photographed(tmp_path)
-    trained(tmp_path / "train", inputs, progress, steps=2, **{ablation: False})
+    trained(tmp_path / "train", inputs, progress, steps=2, **ablation)
     _, info = load_field(tmp_path / "train")
-    assert info["settings"][ablation] is False
+    left_out = ablation.get("vanilla", ablation)
+    assert info["settings"] | left_out == info["settings"]
 
 
 def test_without_test_photos_nothing_is_held_out(tmp_path: Path, progress) -> None:
@@ -177,10 +186,10 @@ def test_without_test_photos_nothing_is_held_out(tmp_path: Path, progress) -> No
 def test_probes_are_at_the_size_that_photos_are_scored_at(tmp_path: Path, progress) -> None:
     inputs, scene = photographed(tmp_path)
     dataset = training_dataset(inputs["ingest"], scene, "test", 2.0, progress)
-    unseen = unseen_photos(Config(downscale=2.0), inputs["ingest"], scene, "test", "cpu", progress)
-    assert unseen
+    held_out = held_out_evaluation(Config(downscale=2.0), inputs["ingest"], scene, "test", "cpu", progress)
+    assert held_out
     ball_and_white = {(30, 60, 200), (255, 255, 255)}
-    assert {*map(tuple, (unseen.probe.colours * 255).round().int().tolist())} == ball_and_white
+    assert {*map(tuple, (held_out.pixels.colours * 255).round().int().tolist())} == ball_and_white
     assert not {*map(tuple, dataset.pixels[:, :3].tolist())} <= ball_and_white, "at the trained size edges are mixed"
 
 
@@ -188,46 +197,63 @@ def test_test_photos_of_which_masks_leave_nothing_stop_no_training(tmp_path: Pat
     """Validation photos, by which a run is to end, do."""
     inputs, masked = photographed(tmp_path, mask=np.zeros((HEIGHT, WIDTH), np.uint8))
     config = Config(downscale=2.0)
-    assert unseen_photos(config, inputs["ingest"], masked, "test", "cpu", progress) is None
+    assert held_out_evaluation(config, inputs["ingest"], masked, "test", "cpu", progress) is None
     why = "the masks ignore every pixel of the test photos at this size"
     assert progress.notes == [f"test photos are not measured while training: {why}"]
     with refused("train.all-masked"):
-        unseen_photos(config, inputs["ingest"], with_validation(masked), "validation", "cpu", progress)
+        held_out_evaluation(config, inputs["ingest"], with_validation_split(masked), "validation", "cpu", progress)
 
 
 def test_two_budgets_are_refused_in_words() -> None:
-    with pytest.raises(ValidationError, match=r"steps \(500\) and seconds \(60\) are two budgets; give one"):
+    with pytest.raises(ValidationError, match=r"--train\.steps 500 and --train\.seconds 60 are two budgets; give one"):
         Config(steps=500, seconds=60)
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"field": "grid", "width": 64}, r"width \(64\) does not belong to the grid field; leave out one of the two"),
-        ({"field": "grid", "preset": "paper"}, r"preset \(paper\) does not belong to the grid field"),
-        ({"field": "grid", "hierarchical": False}, r"hierarchical \(False\) does not belong to the grid field"),
-        ({"preset": "paper", "levels": 4}, r"levels \(4\) belongs to the grid field and preset \(paper\) to the paper"),
-        ({"field": "paper", "levels": 4}, r"levels \(4\) does not belong to the paper field"),
-        ({"finest": 64, "depth": 4}, r"finest \(64\) belongs to the grid field and depth \(4\) to the paper field"),
+        ({"field": "grid", "vanilla": {"width": 64}}, "vanilla.width has no effect with --train.field grid; leave out"),
+        ({"field": "grid", "preset": "paper"}, "preset paper has no effect with --train.field grid"),
+        (
+            {"field": "grid", "vanilla": {"hierarchical": False}},
+            "vanilla.hierarchical has no effect with --train.field",
+        ),
+        ({"preset": "paper", "grid": {"num_levels": 4}}, "grid.num-levels has no effect with --train.preset paper"),
+        ({"field": "vanilla", "grid": {"num_levels": 4}}, "grid.num-levels has no effect with --train.field vanilla"),
+        ({"grid": {"max_res": 64}, "vanilla": {"depth": 4}}, "vanilla.depth has no effect with --train.grid.max-res"),
     ],
 )
 def test_contradicting_options_are_refused_in_words(given: dict, message: str) -> None:
-    with pytest.raises(ValidationError, match=message):
+    with pytest.raises(ValidationError, match=f"--train.{message}"):
         Config(**given)
 
 
-def test_options_of_the_paper_field_ask_for_it() -> None:
-    of_paper: list[dict[str, Any]] = [{"preset": "paper"}, {"width": 64}, {"hierarchical": False}, {"field": "paper"}]
-    of_grid: list[dict[str, Any]] = [{}, {"steps": 3}, {"learning_rate": 1e-3}, {"levels": 4}, {"field": "grid"}]
-    assert {Config(**given).kind for given in of_paper} == {"paper"}
-    assert {Config(**given).kind for given in of_grid} == {"grid"}
+def test_options_of_a_field_ask_for_it() -> None:
+    vanilla: list[dict[str, Any]] = [
+        *({"preset": "paper"}, {"field": "vanilla"}, {"field": "vanilla", "preset": "paper"}),
+        *({"vanilla": {"width": 64}}, {"vanilla": {"hierarchical": False}}),
+    ]
+    grid: list[dict[str, Any]] = [
+        {},
+        {"steps": 3},
+        {"learning_rate": 1e-3},
+        {"grid": {"num_levels": 4}},
+        {"field": "grid"},
+    ]
+    assert {Config(**given).kind for given in vanilla} == {"vanilla"}
+    assert {Config(**given).kind for given in grid} == {"grid"}
 
 
-def test_every_option_is_shared_or_of_one_field() -> None:
-    shared = {"field", "preset", "steps", "seconds", "learning_rate", "seed", "downscale", "background", "contracted"}
-    shared |= {"view_dependence", "checkpoint_seconds", "tensorboard", "target_psnr", "matmul"}
-    shared |= {"after", "more_steps", "more_seconds"}
-    assert sorted([*shared, *GRID_ONLY, *PAPER_ONLY]) == sorted(Config.model_fields)
+def test_every_field_has_its_options_under_its_name() -> None:
+    assert {name: Config.model_fields[name].annotation for name in FIELD_NAMES} == OPTIONS_OF_FIELD
+
+
+@pytest.mark.parametrize("given", [{}, {"grid": {"num_levels": 4}}, {"preset": "paper"}, {"vanilla": {"width": 9}}])
+def test_recorded_options_are_of_one_field_alone(given: dict) -> None:
+    config = Config(**given)
+    assert {*config.model_dump(mode="json")} & {*FIELD_NAMES} == {config.kind}
+    assert {*config.model_dump(include={*FIELD_NAMES})} == {config.kind}
+    assert Config.model_validate_json(config.model_dump_json()) == config
 
 
 @pytest.mark.parametrize("bounded", [True, False])
@@ -240,10 +266,10 @@ def test_plan_answers_everything_for_the_grid_field(
     assert (planned.field, planned.seconds, planned.contracted) == ("grid", 180, not bounded)
     assert any(note.startswith("180 s on this machine draw about ") for note in progress.notes)
     assert (planned.downscale, planned.background) == (1.0, "random")
-    assert planned.levels and planned.log2_rows and planned.finest and planned.batch_samples
+    assert None not in planned.grid.model_dump().values()
     assert planned.learning_rate == LEARNING_RATES["bounded" if bounded else "contracted"]
     assert train.plan(Config.model_validate(planned.model_dump()), inputs, progress) == planned
-    assert train.plan(Config(levels=3, finest=64), inputs, progress).levels == 3
+    assert train.plan(Config(grid=HashGridOptions(num_levels=3, max_res=64)), inputs, progress).grid.num_levels == 3
 
 
 def test_masked_pixels_do_not_count_for_photo_size(
@@ -252,7 +278,7 @@ def test_masked_pixels_do_not_count_for_photo_size(
     monkeypatch.setattr("stages.train.planning.MIN_LONG_SIDE", 2)
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[: HEIGHT // 4] = 255
-    sizes: dict[str, Any] = {"levels": 2, "log2_rows": 8, "finest": 16, "batch_samples": 256, "steps": 2}
+    grid = HashGridOptions(num_levels=2, log2_hashmap_size=8, max_res=16, target_samples=256)
     chosen = []
     for name, given, opaque in (("all", None, None), ("some", mask, None), ("cut out", mask, "yes")):
         inputs, scene = photographed(tmp_path / name, mask=given)
@@ -262,28 +288,28 @@ def test_masked_pixels_do_not_count_for_photo_size(
             for v in scene.views
         ]
         write_photos(inputs["ingest"], photos, [], {})
-        chosen.append(train.plan(Config(**sizes), inputs, progress).downscale)
+        chosen.append(train.plan(Config(steps=2, grid=grid), inputs, progress).downscale)
     assert chosen[0] == pytest.approx(2 * chosen[1], abs=0.2) and chosen[1] == chosen[2] > 1
 
 
-def test_plan_answers_everything_for_the_paper_field(
+def test_plan_answers_everything_for_the_vanilla_field(
     tmp_path: Path, progress: Progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("stages.train.planning.TIMED_SECONDS", 0.01)
     inputs, _ = photographed(tmp_path)
-    planned = train.plan(Config(batch_rays=8), inputs, progress)
-    assert (planned.field, planned.background, planned.levels) == ("paper", "white", None)
-    assert (planned.preset, planned.depth, planned.width) == ("standard", 4, 64)
-    assert (planned.samples_coarse, planned.samples_fine) == (32, 32)
-    assert (planned.batch_rays, planned.learning_rate) == (8, 5e-3)
+    planned = train.plan(Config(vanilla=VanillaOptions(batch_rays=8)), inputs, progress)
+    sizes = planned.vanilla
+    assert (planned.field, planned.background, planned.preset) == ("vanilla", "white", "standard")
+    assert (sizes.depth, sizes.width, sizes.samples_coarse, sizes.samples_fine) == (4, 64, 32, 32)
+    assert (sizes.batch_rays, planned.learning_rate) == (8, 5e-3)
     assert (planned.seconds, planned.steps) == (180, None)
-    assert (planned.contracted, planned.spacing, planned.downscale) == (False, "linear", 1.0)
+    assert (planned.contracted, sizes.spacing, planned.downscale) == (False, "linear", 1.0)
     assert train.plan(Config.model_validate(planned.model_dump()), inputs, progress) == planned
 
 
 def test_presets_are_budgets_unless_one_is_given(tmp_path: Path, progress: Progress) -> None:
     inputs, _ = photographed(tmp_path)
-    sizes: dict[str, Any] = {"downscale": 1.0, "levels": 2, "log2_rows": 8, "finest": 16}
+    sizes: dict[str, Any] = {"downscale": 1.0, "grid": {"num_levels": 2, "log2_hashmap_size": 8, "max_res": 16}}
 
     def budget(**given: Any) -> tuple[float | None, int | None]:
         planned = train.plan(Config(**given), inputs, progress)
@@ -297,25 +323,26 @@ def test_presets_are_budgets_unless_one_is_given(tmp_path: Path, progress: Progr
 
 def test_the_published_preset_is_the_published_model(tmp_path: Path, progress: Progress) -> None:
     inputs, _ = photographed(tmp_path, bounded=False)
-    planned = train.plan(Config(preset="paper", steps=10, width=128), inputs, progress)
-    assert (planned.depth, planned.width, planned.skip) == (8, 128, 4)
-    assert (planned.samples_coarse, planned.samples_fine) == (64, 128)
-    assert (planned.batch_rays, planned.learning_rate) == (1024, 5e-4)
-    assert (planned.contracted, planned.spacing) == (True, "log")
+    planned = train.plan(Config(preset="paper", steps=10, vanilla=VanillaOptions(width=128)), inputs, progress)
+    sizes = planned.vanilla
+    assert (sizes.depth, sizes.width, sizes.skip) == (8, 128, 4)
+    assert (sizes.samples_coarse, sizes.samples_fine) == (64, 128)
+    assert (sizes.batch_rays, planned.learning_rate) == (1024, 5e-4)
+    assert (planned.contracted, sizes.spacing) == (True, "log")
 
 
 def test_every_seed_is_measured_on_the_same_pixels(tmp_path: Path, progress) -> None:
     inputs, scene = photographed(tmp_path, views=12)
-    scene = with_validation(scene)
+    scene = with_validation_split(scene)
     found = []
     for seed in (0, 5):
         (folder := tmp_path / f"train{seed}").mkdir()
-        config = train.plan(Config(**TINY, steps=1, seed=seed, target_psnr=20.0), inputs, progress)
-        probes = prepare(config, scene, inputs, folder, progress).probes
-        assert probes.test and probes.target
-        unseen = (probes.test, probes.target.photos)
-        others = (probe for each in unseen for probe in (each.probe, each.patches.probe))
-        found.append([probe.colours for probe in (probes.train, *others)])
+        config = train.plan(tiny(steps=1, seed=seed, target_psnr=20.0), inputs, progress)
+        evaluation_sets = prepare(config, scene, inputs, folder, progress).evaluation_sets
+        assert evaluation_sets.test and evaluation_sets.target
+        held_out = (evaluation_sets.test, evaluation_sets.target.held_out)
+        others = (pixels for each in held_out for pixels in (each.pixels, each.patches.pixels))
+        found.append([pixels.colours for pixels in (evaluation_sets.train, *others)])
     assert len(found[0]) == 5 and all(torch.equal(*pair) for pair in zip(*found, strict=True))
 
 
@@ -323,16 +350,16 @@ def test_a_run_in_seconds_keeps_to_them(tmp_path: Path, progress) -> None:
     inputs, _ = photographed(tmp_path)
     result = trained(tmp_path / "train", inputs, progress, seconds=1.0)
     assert 0.7 < result.facts["train_seconds"] < 1.5
-    decisions = json.loads((tmp_path / "train" / "plan.json").read_text())
+    decisions = json.loads((tmp_path / "train" / "schedule.json").read_text())
     assert decisions[-1][1] == result.facts["steps"] > 2
 
 
-def test_a_target_is_judged_on_photos_set_aside(tmp_path: Path, progress) -> None:
+def test_a_target_is_judged_on_validation_photos(tmp_path: Path, progress) -> None:
     inputs, _ = photographed(tmp_path, views=12, channels=4)
     result = trained(tmp_path / "train", inputs, progress, field="grid", steps=400, target_psnr=14.0)
-    assert "1 of 9 training photos are set aside to tell when 14 dB are reached" in progress.notes
+    assert "1 of 9 training photos become validation photos, to tell when 14 dB are reached" in progress.notes
     assert result.facts["steps"] < 400 and result.facts["validation_psnr"] >= 14
-    assert "14 dB reached after" in result.line
+    assert "14 dB reached on validation photos after" in result.line
     assert "validation" not in (inputs["normalise"] / "scene.json").read_text()
 
 

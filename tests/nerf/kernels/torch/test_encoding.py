@@ -28,12 +28,12 @@ def random_inputs(layout: GridLayout = LAYOUT, count: int = 40) -> tuple[Tensor,
 
 def row_of_vertex(layout: GridLayout, level: int, vertex: tuple[int, ...]) -> int:
     x, y, z = vertex
-    if layout.hashed(level):
+    if layout.is_hashed(level):
         number = (x ^ (y * 2654435761) & 0xFFFFFFFF ^ (z * 805459861) & 0xFFFFFFFF) % layout.level_rows(level)
     else:
         side = layout.resolutions[level] + 1
         number = (x * side + y) * side + z
-    return layout.first_rows[level] + number
+    return layout.level_offsets[level] + number
 
 
 def encoded_slowly(layout: GridLayout, table: Tensor, point: Tensor) -> list[float]:
@@ -55,11 +55,11 @@ def encoded_slowly(layout: GridLayout, table: Tensor, point: Tensor) -> list[flo
 
 def test_the_layout_is_dense_until_the_table_is_too_small() -> None:
     assert LAYOUT.resolutions == (3, 5, 9)
-    assert LAYOUT.first_rows == (0, 64, 64 + 128, 64 + 128 + 128)
-    assert [LAYOUT.hashed(level) for level in range(3)] == [False, True, True]
+    assert LAYOUT.level_offsets == (0, 64, 64 + 128, 64 + 128 + 128)
+    assert [LAYOUT.is_hashed(level) for level in range(3)] == [False, True, True]
     assert (LAYOUT.rows, LAYOUT.width) == (320, 6)
-    assert grid_layout(1, 7, 7, 9, 4).first_rows == (0, 512)
-    assert not grid_layout(1, 7, 7, 9, 4).hashed(0)
+    assert grid_layout(1, 7, 7, 9, 4).level_offsets == (0, 512)
+    assert not grid_layout(1, 7, 7, 9, 4).is_hashed(0)
 
 
 def test_features_are_those_of_a_slow_loop() -> None:

@@ -82,8 +82,8 @@ def test_other_sums_along_rays_of_4096_samples(device: str, varied: bool) -> Non
     hidden = (0.1 * each[:, None] - 0.06).relu().repeat(1, 64)
     given = 0.1 * each[:, None].repeat(1, 64)
     wanted = given.double()
-    of_ray = warp.add_ray_relu_backward(samples, hidden, given)
-    assert relative_error(of_ray, reference.add_ray_relu_backward(samples, hidden.double(), wanted)) < 5e-6
+    ray_hidden = warp.add_ray_relu_backward(samples, hidden, given)
+    assert relative_error(ray_hidden, reference.add_ray_relu_backward(samples, hidden.double(), wanted)) < 5e-6
 
 
 @pytest.mark.parametrize("varied", [False, True])
@@ -112,10 +112,10 @@ def test_what_is_done_to_each_of_4096_samples(device: str, varied: bool) -> None
     for thin in (0.0, 0.01):
         kept, _ = agree("visible_samples", samples, each, 0.2, thin, uniform(device, 33, 3), tolerance=1e-6)
         assert kept.starts.diff().min() > (100 if thin else 1000) and len(kept.t) < len(each) / 2
-    hidden, of_ray = normal(device, 27, len(each), 64), normal(device, 29, 3, 64)
+    hidden, ray_hidden = normal(device, 27, len(each), 64), normal(device, 29, 3, 64)
     given, wanted = hidden.clone(), hidden.clone()
-    warp.add_ray_relu(samples, given, of_ray)
-    reference.add_ray_relu(samples, wanted, of_ray)
+    warp.add_ray_relu(samples, given, ray_hidden)
+    reference.add_ray_relu(samples, wanted, ray_hidden)
     assert torch.equal(given, wanted)
     rounds, _ = agree("pack_rounds", [samples, packed(device, [4096, 0, 1])])
     assert rounds.starts.diff().tolist() == [8192, 4096, 4097]
@@ -180,8 +180,8 @@ def test_what_is_wrong_on_one_ray_changes_nothing_on_others(device: str, backend
         pull = backend.distortion_backward(samples, weights, GROWING, on_spread)
         kept, index = backend.visible_samples(samples, sigma, 1e-3, 0.05, on_spread.abs().clamp(max=0.9))
         visible = [part[kept.ray != 1] for part in (index, kept.t, kept.dt)]
-        of_rays = [part[[0, 2]] for part in (*rendering, spread)]
-        return [*(part[elsewhere] for part in (*of_samples, pull)), *of_rays, *visible]
+        ray_hidden = [part[[0, 2]] for part in (*rendering, spread)]
+        return [*(part[elsewhere] for part in (*of_samples, pull)), *ray_hidden, *visible]
 
     for one, right in zip(on_others(wrong), on_others(0.5), strict=True):
         assert relative_error(one.float(), right) < 1e-6 and right.any()

@@ -78,7 +78,9 @@ OUTDOORS = replace(BOUNDED, space=Contraction(), min_step_size=0.1, cone_angle=0
 def small_trainer(field: HashGridSettings) -> HashGridTrainer:
     """A step has sixteen rays, two of which run to points whose distance is known."""
     background = (0.0, 0.0, 0.0) if field.background_model else "random"
-    settings = HashGridTrainerSettings(3, background, samples=512, chunks=4, distortion=1e-3, depth_loss=0.1)
+    settings = HashGridTrainerSettings(
+        3, background, target_samples=512, micro_batches=4, distortion_weight=1e-3, depth_weight=0.1
+    )
     model = HashGridField(field, 0, warp)
     model.set_occupancy(warp.occupancy_bits(torch.rand(512, generator=torch.Generator().manual_seed(2)), 0.3))
     opaque = (noise_dataset().pixels[:, 3] == 255).nonzero()[:, 0]
@@ -107,8 +109,11 @@ def test_training_bits_are_the_same_on_any_threads(
 ) -> None:
     monkeypatch.setattr("nerf.fields.occupancy_grid.CHUNK_POINTS", 128)  # several chunks even here
     trainer, used = small_trainer(field), set[int]()
-    guided = [int((trainer._batch(0, 0.0, chunk, trainer._rays_per_chunk()).distance > 0).sum()) for chunk in range(4)]
-    assert sum(guided) == 2 and trainer._rays_per_chunk() == 4
+    guided = [
+        int((trainer._batch(0, 0.0, chunk, trainer._rays_per_micro_batch()).sparse_depth > 0).sum())
+        for chunk in range(4)
+    ]
+    assert sum(guided) == 2 and trainer._rays_per_micro_batch() == 4
     forward = trainer.model.forward
     monkeypatch.setattr(trainer.model, "forward", lambda *chunk: used.add(threading.get_ident()) or forward(*chunk))
     start = copied(trainer.state())
@@ -172,7 +177,7 @@ def everything(seed: int) -> list[Tensor]:
     hidden = torch.randn(len(samples.t), 64, generator=random)
     warp.add_ray_relu(samples, hidden, torch.randn(count, 64, generator=random))
     grad_hidden, grad_rectified = hidden.clone(), hidden + 1
-    of_ray = warp.add_ray_relu_backward(samples, hidden, grad_hidden)
+    ray_hidden = warp.add_ray_relu_backward(samples, hidden, grad_hidden)
     warp.relu_backward(hidden, grad_rectified)
     adam = [torch.randn(layout.rows, 4, generator=random), grad_table.clone(), grad_table.clone(), grad_table.abs()]
     warp.adam(adam[0], adam[1], adam[2], adam[3], 1e-2, 3)
@@ -182,7 +187,7 @@ def everything(seed: int) -> list[Tensor]:
         *(bits, *samples, points, features, grad_table, grad_points, *grad_rays, *front, kept, *rendering, weights),
         *(*grad_field, spread, grad_weights, apart, *grad_apart, depth, near, *rounds, order),
         *(*drawn.samples, drawn.rows, drawn.weights, drawn_depth, shown, seen),
-        *(harmonics, grad_directions, hidden, grad_hidden, grad_rectified, of_ray, *adam, thickness),
+        *(harmonics, grad_directions, hidden, grad_hidden, grad_rectified, ray_hidden, *adam, thickness),
     ]
 
 

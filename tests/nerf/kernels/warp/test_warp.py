@@ -97,7 +97,7 @@ def test_gradients_of_the_encoding(device: str, layout) -> None:
     grad = normal(device, 3, len(points), layout.width)
     agree("encode_backward_points", layout, table, points, grad)
     given, wanted = normal(device, 4, layout.rows, 4), normal(device, 4, layout.rows, 4).double()
-    for level, (first, end) in enumerate(pairwise(layout.first_rows)):
+    for level, (first, end) in enumerate(pairwise(layout.level_offsets)):
         before = given.clone()
         warp.encode_backward_table(layout, level, points, grad, given)
         reference.encode_backward_table(layout, level, points.double(), grad.double(), wanted)
@@ -133,11 +133,11 @@ def hidden_of(device: str) -> Tensor:
 
 def test_the_hidden_layer(device: str) -> None:
     samples, hidden = packed(device, COUNTS), hidden_of(device)
-    of_ray = normal(device, 29, len(COUNTS), 64)
-    of_ray[5:8, ::2] = 0
+    ray_hidden = normal(device, 29, len(COUNTS), 64)
+    ray_hidden[5:8, ::2] = 0
     given, wanted = hidden.clone(), hidden.clone()
-    warp.add_ray_relu(samples, given, of_ray)
-    reference.add_ray_relu(samples, wanted, of_ray)
+    warp.add_ray_relu(samples, given, ray_hidden)
+    reference.add_ray_relu(samples, wanted, ray_hidden)
     assert torch.equal(given, wanted) and 0.2 < (given > 0).float().mean() < 0.8
 
 
@@ -147,12 +147,12 @@ def test_gradients_of_the_hidden_layer(device: str, function: str) -> None:
     grad = normal(device, 30, *hidden.shape)
     given, wanted = grad.clone(), grad.double()
     arguments = (samples,) if function == "add_ray_relu_backward" else ()
-    of_ray = getattr(warp, function)(*arguments, hidden, given)
+    ray_hidden = getattr(warp, function)(*arguments, hidden, given)
     right = getattr(reference, function)(*doubled((*arguments, hidden)), wanted)
     assert torch.equal(given, torch.where(hidden > 0, grad, 0))
     assert (hidden[hidden > 0].min() < 1e-44) and torch.equal(given.double(), wanted)
     if right is not None:
-        assert relative_error(of_ray, right) < TOLERANCE
+        assert relative_error(ray_hidden, right) < TOLERANCE
 
 
 # Adam

@@ -15,7 +15,16 @@ from stages.io.photos import Photo
 from stages.sfm import global_mapping
 from stages.sfm.colmap.diagnosis import compare_models
 from stages.sfm.colmap.mapping import incremental_options, map_incrementally
-from stages.sfm.colmap.repair import check_model, copy_consistent_matches, deregister, facts, reasons, register_again
+from stages.sfm.colmap.repair import (
+    agreeing_pairs,
+    better,
+    check_model,
+    copy_consistent_matches,
+    deregister,
+    facts,
+    reasons,
+    register_again,
+)
 from stages.sfm.colmap.thinning import thin_matches
 from stages.sfm.matching import consecutive_pairs
 from stages.sfm.retry_strategies import MappingOptions
@@ -61,6 +70,27 @@ def test_true_poses_pass(made: Made) -> None:
     assert said["doubtful"] == [] and said["pairs"] == said["agreeing"] == PHOTOS * (PHOTOS - 1) / 2
     assert 0.3 < said["error_px"] < 1.5
     assert {image["agreement"] for image in said["images"].values()} == {1.0}
+
+
+def test_a_model_that_is_wrong_as_a_whole_loses(made: Made) -> None:
+    """Its own tolerance is that of its errors: alone it would nearly pass."""
+    wrong = pycolmap.Reconstruction(made.model)
+    for image_id in range(1, PHOTOS + 1):
+        turn(wrong, image_id, 0.15 * (-1) ** image_id)
+    candidates = [(model, check_model(model, made.database, 0)) for model in (wrong, made.model)]
+    assert candidates[0][1].check.tolerance_px > 1.5 * candidates[1][1].check.tolerance_px
+    assert candidates[0][1].check.passed.sum() > PHOTOS / 2
+    assert better(*candidates) is better(*candidates[::-1]) is candidates[1]
+    pairs, wrong_pairs = agreeing_pairs(candidates[1], candidates[0], [made.model.image(5).name])
+    assert wrong_pairs < pairs == PHOTOS - 1
+    noise = candidates[0][1].matches.noise_px  # of the matches, whatever the poses
+    assert 0.1 < noise < 0.6 and noise == candidates[1][1].matches.noise_px
+
+
+def test_of_models_that_agree_as_well_the_first_is_taken(made: Made) -> None:
+    same = pycolmap.Reconstruction(made.model)
+    candidates = [(model, check_model(model, made.database, 0)) for model in (made.model, same)]
+    assert better(*candidates) is candidates[0] and better(*candidates[::-1]) is candidates[1]
 
 
 def test_a_turned_photo_is_named_and_registered_again(made: Made, tmp_path: Path) -> None:

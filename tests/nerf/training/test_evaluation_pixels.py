@@ -5,9 +5,14 @@ import torch
 
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
+from nerf.training.evaluation_pixels import (
+    evaluate,
+    render_patches,
+    sample_evaluation_patches,
+    sample_evaluation_pixels,
+)
 from nerf.training.metrics import PSNR_LIMIT
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
-from nerf.training.validation_probe import make_patches, make_probe, measure, pictures
 
 
 class Painted:
@@ -36,18 +41,20 @@ def painted_dataset() -> RayDataset:
 
 
 def test_a_perfect_model_scores_the_limit() -> None:
-    result = measure(Painted(), make_probe(painted_dataset(), 3000, torch.zeros(3), seed=0))
+    result = evaluate(Painted(), sample_evaluation_pixels(painted_dataset(), 3000, torch.zeros(3), seed=0))
     assert result.psnr == PSNR_LIMIT
     assert result.opacity == 0.5
 
 
 def test_flat_psnr_is_the_variance_of_the_colours() -> None:
-    probe = make_probe(painted_dataset(), 20_000, torch.zeros(3), seed=0)
-    assert abs(probe.mean_colour_psnr - -10 * math.log10(1 / 12)) < 0.2
+    pixels = sample_evaluation_pixels(painted_dataset(), 20_000, torch.zeros(3), seed=0)
+    assert abs(pixels.mean_colour_psnr - -10 * math.log10(1 / 12)) < 0.2
 
 
 def test_a_probe_is_always_the_same() -> None:
-    first, again, other = (make_probe(painted_dataset(), 50, torch.zeros(3), seed).colours for seed in (4, 4, 5))
+    first, again, other = (
+        sample_evaluation_pixels(painted_dataset(), 50, torch.zeros(3), seed).colours for seed in (4, 4, 5)
+    )
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
@@ -64,7 +71,7 @@ def two_photos(grey: float = 0.0) -> RayDataset:
 
 
 def test_patches_are_squares_of_the_photos() -> None:
-    shown, truth = pictures(Painted(), make_patches(two_photos(), 40, 9, torch.zeros(3), seed=1))
+    shown, truth = render_patches(Painted(), sample_evaluation_patches(two_photos(), 40, 9, torch.zeros(3), seed=1))
     assert shown.shape == truth.shape == (40, 9, 9, 3) and not shown.any()
     values = (truth * 255).round().long()
     steps = torch.arange(9)
@@ -76,16 +83,16 @@ def test_patches_are_squares_of_the_photos() -> None:
 
 
 def test_patches_fit_into_the_smallest_photo() -> None:
-    patches = make_patches(two_photos(), 5, 50, torch.zeros(3), seed=1)
+    patches = sample_evaluation_patches(two_photos(), 5, 50, torch.zeros(3), seed=1)
     assert patches.used.shape == (5, 13, 13) and patches.used.all()
 
 
 def test_patches_know_what_masks_ignore() -> None:
     ignored = torch.zeros(20, 30, dtype=torch.bool)
     ignored[:, :10] = True
-    dataset = two_photos().without([ignored, torch.ones(13, 17, dtype=torch.bool)])
-    patches = make_patches(dataset, 40, 9, torch.zeros(3), seed=1)
-    _, truth = pictures(Painted(), patches)
+    dataset = two_photos().with_masks([ignored, torch.ones(13, 17, dtype=torch.bool)])
+    patches = sample_evaluation_patches(dataset, 40, 9, torch.zeros(3), seed=1)
+    _, truth = render_patches(Painted(), patches)
     values = (truth * 255).round().long()
     assert (values[..., 0] == 0).all(), "nothing of the second photo is used"
     assert torch.equal(patches.used, values[..., 2] >= 10)
@@ -93,13 +100,14 @@ def test_patches_know_what_masks_ignore() -> None:
 
 
 def test_a_picture_is_as_bright_as_a_photo_can_be() -> None:
-    shown, _ = pictures(Painted(), make_patches(two_photos(grey=1.5), 4, 9, torch.zeros(3), seed=1))
+    shown, _ = render_patches(Painted(), sample_evaluation_patches(two_photos(grey=1.5), 4, 9, torch.zeros(3), seed=1))
     assert (shown == 1).all()
 
 
 def test_scores_clamp_colours_like_a_photo() -> None:
     too_bright, white = (
-        measure(Painted(), make_probe(two_photos(grey), 50, torch.zeros(3), seed=0)).psnr for grey in (1.5, 1.0)
+        evaluate(Painted(), sample_evaluation_pixels(two_photos(grey), 50, torch.zeros(3), seed=0)).psnr
+        for grey in (1.5, 1.0)
     )
     assert too_bright == white
 
@@ -109,4 +117,4 @@ def test_what_is_no_finite_number_has_no_score(value: float, monkeypatch: pytest
     painted = Painted.render
     monkeypatch.setattr(Painted, "render", lambda *given: painted(*given)._replace(colour=value * torch.ones(1, 50, 3)))
     with pytest.raises(ValueError, match="mean squared error"):
-        measure(Painted(), make_probe(two_photos(), 50, torch.zeros(3), seed=0))
+        evaluate(Painted(), sample_evaluation_pixels(two_photos(), 50, torch.zeros(3), seed=0))
