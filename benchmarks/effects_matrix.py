@@ -55,7 +55,7 @@ CELLS = {
     "poses, alpha": cell(Effects(jitter_px=3.0, alpha=True), "pose_refinement"),
     "vignetting": cell(Effects(vignetting_ev=1.0), "background", "vignetting"),
     "passers-by": cell(Effects(strangers=0.15), "background", "transients"),
-    "4 × distance": cell(Effects(farther=4.0), "background", "scale"),
+    "4 × distance": cell(Effects(farther=4.0), "background", "scale_variation"),
 }
 
 
@@ -69,8 +69,8 @@ class Outcome(NamedTuple):
 
     @property
     def on(self) -> set[str]:
-        """The modelled effects that are on, lens and view dependence aside."""
-        aside = ("lens", "view_dependence")
+        """The modelled effects that are on, camera model and view dependence aside."""
+        aside = ("camera_model", "view_dependence")
         return {name for name, entry in self.table.items() if entry["on"] and entry["modelled"] and name not in aside}
 
 

@@ -40,6 +40,11 @@ EFFECTS: dict[str, str] = {
     r"\b(PhotoRays|PhotoColours|AsGiven|AsRendered|photo_parts)\b": "ImageEffects",
     r"\b(Exposures|RefinedPoses)\b": "ExposureModel, PoseRefinement",
     r"neutral exposure": "reference exposure",
+    r"\b(HARM|SURE)\b": "MIN_EFFECT, MIN_SIGNAL_TO_NOISE",
+    r"\b_?judged\(": "classify",
+    r"(?i)two.?way\b": "additive view/point model",
+    r"\b(Odd|odd_photos)\b": "outlier images",
+    r"\b(lens|media|scale)_evidence": "camera_model_evidence, participating_media_evidence, scale_variation_evidence",
 }
 
 SFM_AND_INGEST: dict[str, str] = {

@@ -20,7 +20,7 @@ from stages.effects.effect_list import EFFECTS
 from stages.io.files import read_json, read_scene
 
 INPUTS = ("ingest", "sfm", "normalise")
-VERSION = 13
+VERSION = 14
 EXIT_CODE = 13
 RESUMES = False
 PUBLISHED = ("effects.json",)

@@ -7,16 +7,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from nerf.effects.statistics.background import background_evidence, untracked_share
-from nerf.effects.statistics.blur import blur_evidence
-from nerf.effects.statistics.exposure import ExposureFit, exposure_evidence, fit_exposure, tone_evidence
-from nerf.effects.statistics.media import media_evidence
+from nerf.effects.statistics.exposure import ExposureFit, exposure_evidence, fit_exposure
+from nerf.effects.statistics.outlier_images import OutlierImages, outlier_images
 from nerf.effects.statistics.poses import common_residuals, pose_evidence
-from nerf.effects.statistics.rolling_shutter import across_rows, motion_to_next, rolling_shutter_evidence
-from nerf.effects.statistics.scale import scale_evidence
 from nerf.effects.statistics.statistic import Evidence, unknown
 from nerf.effects.statistics.tracks import TrackColours
-from nerf.effects.statistics.transients import Odd, odd_photos, transients_evidence
 from nerf.effects.statistics.vignetting import vignetting_evidence
+from nerf.effects.statistics.warnings import (
+    across_rows,
+    motion_to_next,
+    participating_media_evidence,
+    rolling_shutter_evidence,
+    scale_variation_evidence,
+    tone_evidence,
+    transients_evidence,
+)
 from stages.contract import Progress
 from stages.effects.track_colours import look_at_photos
 from stages.io.photos import read_photos
@@ -48,13 +53,12 @@ class Places(NamedTuple):
 
 class Observations(NamedTuple):
     """All that statistics look at: ``tracks`` read off the photos, the ``exposure`` fitted to them, ``outliers`` among
-    the photos, the ``exif_ev`` that the camera wrote, the photos' ``gradients``, and ``places``."""
+    the photos, the ``exif_ev`` that the camera wrote, and ``places``."""
 
     tracks: TrackColours
     exposure: ExposureFit
-    outliers: Odd
+    outliers: OutlierImages
     exif_ev: np.ndarray
-    gradients: np.ndarray
     places: Places
 
 
@@ -72,9 +76,8 @@ def observed(
     return Observations(
         tracks=looked.tracks,
         exposure=exposure,
-        outliers=odd_photos(looked.tracks, exposure, looked.expected),
+        outliers=outlier_images(looked.tracks, exposure, looked.expected),
         exif_ev=told_exposures(ingest, scene),
-        gradients=looked.gradients,
         places=observed_places(ingest, scene, points, uncertainty_px),
     )
 
@@ -105,7 +108,7 @@ def observed_places(
 def exposure_statistic(seen: Observations) -> Evidence:
     """The deviation of gains over the photos, outliers aside."""
     found = exposure_evidence(seen.exposure, seen.exif_ev, seen.outliers.much)
-    return unless_pixels_differ(found, scale_evidence(seen.tracks))
+    return unless_pixels_differ(found, scale_variation_evidence(seen.tracks))
 
 
 def measured_gains(seen: Observations) -> np.ndarray:
@@ -141,10 +144,9 @@ WARNINGS: dict[str, Callable[[Observations], Evidence]] = {
     "tone": lambda seen: tone_evidence(seen.exposure),
     "vignetting": lambda seen: vignetting_evidence(seen.tracks, seen.exposure),
     "transients": lambda seen: transients_evidence(seen.outliers, seen.exposure),
-    "scale": lambda seen: scale_evidence(seen.tracks),
-    "blur": lambda seen: blur_evidence(seen.gradients),
+    "scale_variation": lambda seen: scale_variation_evidence(seen.tracks),
     "rolling_shutter": lambda seen: rolling_shutter_statistic(seen.places),
-    "participating_media": lambda seen: media_evidence(seen.tracks, seen.exposure),
+    "participating_media": lambda seen: participating_media_evidence(seen.tracks, seen.exposure),
 }
 
 
@@ -163,7 +165,7 @@ def told_exposures(ingest: Path, scene: "Scene") -> np.ndarray:
     return np.array([told.get(view.file) for view in scene.of_split("train")], float)  # None becomes NaN
 
 
-def lens_evidence(registration: dict[str, Any]) -> Evidence:
+def camera_model_evidence(registration: dict[str, Any]) -> Evidence:
     """The choice that stage sfm made by held-out reprojection error, shown beside the others."""
     rows = registration.get("camera_models") or []
     chosen = [row for row in rows if row["chosen"]]

@@ -1,8 +1,8 @@
 """Short paired trainings that tell what an effect is worth, on photos kept back from the training photos.
 
 Both arms have the same seed, rays and number of steps and differ in nothing but the effect. The photos kept back have
-an exposure (and, where an arm refines poses, a pose) of their own, which neither arm knows: both are fitted to the left
-half of such a photo and judged on its right half.
+an exposure (and, where an arm refines poses, a pose) of their own, which neither arm knows: so they are scored by the
+half-image protocol, fitted on the left half and scored on the right one.
 """
 
 import time

@@ -95,9 +95,10 @@ def study(
     statistics_seconds = time.perf_counter() - started
     decisions, verdicts = _Study(config, scene, inputs, found, progress).decide()
     write_decisions(folder, decisions)
-    lens = evidence.lens_evidence(registration)
-    of, seconds = found.of | {"lens": lens}, found.seconds | {"lens": 0.0}  # which stage sfm chose
-    verdicts["lens"] = Verdict(bool(lens.called_for), lens.words)
+    camera_model = evidence.camera_model_evidence(registration)
+    of = found.of | {"camera_model": camera_model}
+    seconds = found.seconds | {"camera_model": 0.0}  # stage sfm chose it
+    verdicts["camera_model"] = Verdict(bool(camera_model.called_for), camera_model.words)
     order = [*verdicts, *(name for name in of if name not in verdicts)]
     table = {name: _entry(verdicts.get(name), of[name], seconds[name]) for name in order}
     write_json(folder / "effects.json", table)

@@ -1,4 +1,4 @@
-"""What the training photos show at the sparse points: their colours, and how sharp the photos are in each direction.
+"""What the training photos show at the sparse points: their colours.
 
 Every photo is decoded once, in full size. A point's colour is the mean over a square window that shows the same piece
 of its surface in every photo, so near photos are given larger windows than far ones.
@@ -6,22 +6,23 @@ of its surface in every photo, so near photos are given larger windows than far 
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
+
+import cv2
+import numpy as np
 
 from nerf import MIN_SATURATED
+from nerf.effects.statistics.outlier_images import NEAR_APART, expected_places
+from nerf.effects.statistics.tracks import TrackColours
+from nerf.geometry.scene import Scene, View
 from stages.contract import Progress
 from stages.hardware.device import processors
-from stages.ingest.sharpness import WIDTH
+from stages.io.pixels import load_mask, load_pixels
+from stages.sfm.colmap.cameras import focal_and_centre, project
 
-if TYPE_CHECKING:
-    import numpy as np
-
-    from nerf.effects.statistics.tracks import TrackColours
-    from nerf.geometry.scene import Scene, View
-
-MOST = 200_000  # observations: gains of 500 photos are then known to a few thousandths
+MAX_OBSERVATIONS = 200_000  # observations: gains of 500 photos are then known to a few thousandths
 MAX_EXPECTED = 1000  # places per photo where a point should be seen and was not matched
 MAX_LOOKED_AT = 12_000_000  # observations of photos nearby that tell these places, for all photos: two seconds
 WINDOW = 1 / 200  # of the photo's longer side: what training at usual sizes makes one pixel or two of
@@ -35,60 +36,51 @@ DECODING_BYTES = 2 << 30  # of photos in memory at a time
 
 
 class PhotoEvidence(NamedTuple):
-    """``tracks``: observed points; ``expected``: places where points should be seen and have no observation;
-    ``gradients``: (views, 2, 2) mean of g g^T over each photo, g the gradient of grey values in [0, 1]."""
+    """``tracks``: observed points; ``expected``: places where points should be seen and have no observation."""
 
-    tracks: "TrackColours"
-    expected: "TrackColours"
-    gradients: "np.ndarray"
+    tracks: TrackColours
+    expected: TrackColours
 
 
 class _Places(NamedTuple):
     """Where to look in one photo: pixel coordinates (n, 2), widths of the windows (n,), odd."""
 
-    xy: "np.ndarray"
-    window: "np.ndarray"
+    xy: np.ndarray
+    window: np.ndarray
 
 
-def look_at_photos(
-    ingest: Path, scene: "Scene", points: "Mapping[str, np.ndarray]", progress: Progress
-) -> PhotoEvidence:
+def look_at_photos(ingest: Path, scene: Scene, points: Mapping[str, np.ndarray], progress: Progress) -> PhotoEvidence:
     """All that is read off the pixels of the training photos, each decoded once; test photos are not looked at.
 
-    Tracks are at most MOST observations, whole tracks evenly drawn; ``points`` is points.safetensors of normalise.
-    Windows that a mask, transparency or the photo's edge cuts are left out."""
-    import numpy as np
-
+    Tracks are at most MAX_OBSERVATIONS, whole ones evenly drawn; ``points`` is points.safetensors of normalise. Windows
+    that a mask, transparency or the photo's edge cuts are left out."""
     views = scene.of_split("train")
-    tracks, xy = training_tracks(scene, points, MOST)
+    tracks, xy = training_tracks(scene, points, MAX_OBSERVATIONS)
     expected, expected_xy = _expected(scene, points, tracks)
     both, at = _joined(tracks, expected), np.concatenate([xy, expected_xy])
     window = _windows(scene, both)
     of_view = [np.flatnonzero(both.view == number) for number in range(len(views))]
 
-    def look(number: int) -> "tuple[np.ndarray, np.ndarray]":
+    def look(number: int) -> np.ndarray:
         chosen = of_view[number]
         return _look(ingest, scene, views[number], _Places(at[chosen], window[chosen]))
 
     seen = np.full((len(both), 5), np.nan)
-    gradients = np.empty((len(views), 2, 2))
     pool = ThreadPoolExecutor(_workers(scene))
     try:
         for number, future in enumerate([pool.submit(look, number) for number in range(len(views))]):
-            seen[of_view[number]], gradients[number] = future.result()
+            seen[of_view[number]] = future.result()
             progress.update(f"looked at {number + 1} of {len(views)} photos", (number + 1) / len(views))
     finally:
         pool.shutdown(cancel_futures=True)
     both = replace(both, colour=seen[:, :3], saturated=seen[:, 3] > 0, texture=seen[:, 4])
     there, observed = np.isfinite(seen[:, 0]), np.arange(len(both)) < len(tracks)
-    return PhotoEvidence(both.only(there & observed), both.only(there & ~observed), gradients)
+    return PhotoEvidence(both.only(there & observed), both.only(there & ~observed))
 
 
-def training_tracks(scene: "Scene", points: "Mapping[str, np.ndarray]", most: int) -> "tuple[TrackColours, np.ndarray]":
+def training_tracks(scene: Scene, points: Mapping[str, np.ndarray], most: int) -> tuple[TrackColours, np.ndarray]:
     """The geometry of the observations of training photos, their colours still black, and their pixels (k, 2); of
     points that two of them see at least. Whole points are left out, evenly, until ``most`` observations are left."""
-    import numpy as np
-
     number = np.full(len(scene.views), -1)
     trained = scene.indices_of("train")
     number[trained] = np.arange(len(trained))
@@ -104,21 +96,14 @@ def training_tracks(scene: "Scene", points: "Mapping[str, np.ndarray]", most: in
     return _seen_from(scene, points["xyz"].astype(float), view[kept], points["point"][kept].astype(int), xy), xy
 
 
-def _seen_from(
-    scene: "Scene", xyz: "np.ndarray", view: "np.ndarray", point: "np.ndarray", xy: "np.ndarray"
-) -> "TrackColours":
+def _seen_from(scene: Scene, xyz: np.ndarray, view: np.ndarray, point: np.ndarray, xy: np.ndarray) -> TrackColours:
     """The geometry of observations; colours are black and nothing is saturated."""
-    import numpy as np
-
-    from nerf.effects.statistics.tracks import TrackColours
-    from stages.sfm.colmap.cameras import focal_and_centre
-
     views = scene.of_split("train")
     if not len(view):
         return replace(TrackColours.empty(len(views)), texture=np.zeros(0))
-    lenses = [focal_and_centre(camera) for camera in scene.cameras]
-    focal = np.array([lenses[one.camera][0] for one in views])[view]
-    middle = np.array([lenses[one.camera][1] for one in views])[view]
+    intrinsics = [focal_and_centre(camera) for camera in scene.cameras]
+    focal = np.array([intrinsics[one.camera][0] for one in views])[view]
+    middle = np.array([intrinsics[one.camera][1] for one in views])[view]
     diagonal = np.array([np.hypot(*_size(scene, one)) for one in views])[view]
     towards = np.stack([one.scene_from_camera[:, 3] for one in views])[view] - xyz[point]
     distance = np.maximum(np.linalg.norm(towards, axis=1), np.finfo(float).tiny)
@@ -136,20 +121,13 @@ def _seen_from(
     )
 
 
-def _size(scene: "Scene", view: "View") -> tuple[int, int]:
+def _size(scene: Scene, view: View) -> tuple[int, int]:
     camera = scene.cameras[view.camera]
     return camera.width, camera.height
 
 
-def _expected(
-    scene: "Scene", points: "Mapping[str, np.ndarray]", tracks: "TrackColours"
-) -> "tuple[TrackColours, np.ndarray]":
+def _expected(scene: Scene, points: Mapping[str, np.ndarray], tracks: TrackColours) -> tuple[TrackColours, np.ndarray]:
     """Where training photos should show points that they have no observation of."""
-    import numpy as np
-
-    from nerf.effects.statistics.transients import expected_places
-    from stages.sfm.colmap.cameras import project
-
     xyz, views = points["xyz"].astype(float), scene.of_split("train")
     centres = np.array([view.scene_from_camera[:, 3] for view in views]).reshape(-1, 3)
     rank = np.unique(tracks.point, return_inverse=True)[1]  # ids may have been drawn in steps themselves
@@ -168,14 +146,10 @@ def _expected(
     return _seen_from(scene, xyz, pairs[:, 0], pairs[:, 1], xy), xy
 
 
-def _seen_nearby(tracks: "TrackColours", rank: "np.ndarray", centres: "np.ndarray", number: int) -> "np.ndarray":
+def _seen_nearby(tracks: TrackColours, rank: np.ndarray, centres: np.ndarray, number: int) -> np.ndarray:
     """Which observations tell what training photo ``number`` should show: those of the photos near it, beside the
     distance of what they observe. Where all photos' together would be more than MAX_LOOKED_AT, only those of every so
     many-th point, other points for each photo. ``rank`` numbers the observed points without gaps."""
-    import numpy as np
-
-    from nerf.effects.statistics.transients import NEAR_APART
-
     apart = np.linalg.norm(centres - centres[number], axis=1)
     apart[number] = np.inf
     near = np.flatnonzero(tracks.distance > apart[tracks.view] / NEAR_APART)
@@ -183,20 +157,14 @@ def _seen_nearby(tracks: "TrackColours", rank: "np.ndarray", centres: "np.ndarra
     return near[rank[near] % step == number % step] if step > 1 else near
 
 
-def _joined(one: "TrackColours", other: "TrackColours") -> "TrackColours":
-    from dataclasses import fields
-
-    import numpy as np
-
+def _joined(one: TrackColours, other: TrackColours) -> TrackColours:
     names = [field.name for field in fields(one) if field.name != "views"]
     return replace(one, **{name: np.concatenate([getattr(one, name), getattr(other, name)]) for name in names})
 
 
-def _windows(scene: "Scene", tracks: "TrackColours") -> "np.ndarray":
+def _windows(scene: Scene, tracks: TrackColours) -> np.ndarray:
     """The width of each observation's window, odd: WINDOW of the photo where the point's pixels are largest, and more
     where they are smaller, so that all show the same piece."""
-    import numpy as np
-
     if not len(tracks):
         return np.zeros(0, int)
     size = np.array([max(_size(scene, view)) for view in scene.of_split("train")])
@@ -207,13 +175,8 @@ def _windows(scene: "Scene", tracks: "TrackColours") -> "np.ndarray":
     return 2 * np.floor(width / 2).astype(int) + 1
 
 
-def _look(ingest: Path, scene: "Scene", view: "View", places: _Places) -> "tuple[np.ndarray, np.ndarray]":
-    """Per place red, green, blue, whether it is clipped, and the texture, NaN where it cannot be used; and the photo's
-    mean of g g^T."""
-    import numpy as np
-
-    from stages.io.pixels import load_mask, load_pixels
-
+def _look(ingest: Path, scene: Scene, view: View, places: _Places) -> np.ndarray:
+    """Per place red, green, blue, whether it is clipped, and the texture, NaN where it cannot be used."""
     width, height = _size(scene, view)
     pixels = load_pixels(ingest / view.file, width, height)
     used = pixels[..., 3] == 255 if scene.has_alpha and pixels.shape[2] == 4 else np.ones(pixels.shape[:2], bool)
@@ -224,23 +187,20 @@ def _look(ingest: Path, scene: "Scene", view: "View", places: _Places) -> "tuple
     whole = ((corner >= 0) & (corner + places.window[:, None] <= [width, height])).all(axis=1)
     if whole.any():
         seen[whole] = _window_means(pixels, used, corner[whole], places.window[whole])
-    return seen, _gradients(pixels)
+    return seen
 
 
-def _window_means(pixels: "np.ndarray", used: "np.ndarray", corner: "np.ndarray", side: "np.ndarray") -> "np.ndarray":
+def _window_means(pixels: np.ndarray, used: np.ndarray, corner: np.ndarray, side: np.ndarray) -> np.ndarray:
     """(n, 5) as :func:`_look` gives them, of square windows that lie in the photo whole.
 
     Sums over windows are differences of the sums from the photo's corner (Crow 1984), one plane after another, so
     neither time nor memory grows with the windows. All are of whole numbers below 2^53, and exact.
     """
-    import cv2
-    import numpy as np
-
     left, top = corner.T
     right, bottom = left + side, top + side
     area = side.astype(float) ** 2
 
-    def summed(plane: "np.ndarray") -> "np.ndarray":
+    def summed(plane: np.ndarray) -> np.ndarray:
         upto = cv2.integral(plane, sdepth=cv2.CV_64F)
         return upto[bottom, right] - upto[bottom, left] - upto[top, right] + upto[top, left]
 
@@ -261,25 +221,7 @@ def _window_means(pixels: "np.ndarray", used: "np.ndarray", corner: "np.ndarray"
     return result
 
 
-def _gradients(pixels: "np.ndarray") -> "np.ndarray":
-    """The mean of g g^T (2, 2) of the grey picture, at most WIDTH wide; what is transparent is black."""
-    import cv2
-    import numpy as np
-
-    grey = cv2.cvtColor(pixels[..., :3], cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
-    if pixels.shape[2] == 4:
-        grey = grey * (pixels[..., 3] / np.float32(255))
-    height, width = grey.shape
-    if width > WIDTH:
-        size = WIDTH, max(1, round(height * WIDTH / width))
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    across = cv2.Scharr(grey, cv2.CV_32F, 1, 0, scale=1 / 32).ravel()
-    down = cv2.Scharr(grey, cv2.CV_32F, 0, 1, scale=1 / 32).ravel()
-    gradient = np.stack([across, down]).astype(float)
-    return gradient @ gradient.T / gradient.shape[1]
-
-
-def _workers(scene: "Scene") -> int:
+def _workers(scene: Scene) -> int:
     """How many photos to decode at a time: one per core, fewer where they are too large for that."""
     largest = max(camera.width * camera.height for camera in scene.cameras)
     return max(1, min(processors(), DECODING_BYTES // (40 * largest)))

@@ -7,13 +7,12 @@ from stages.amounts import duration
 SHORTEST = 0.1  # seconds that are shown as a number
 # What to do about it; the effect's own reason says what was seen.
 ADVICE = {
-    "blur": "Hold the camera still, lock the focus, give more light, and leave blurred photos out.",
     "tone": "Turn off automatic contrast, HDR and filters, or develop all photos with one curve.",
     "rolling_shutter": "Take photos standing still in place of a video, or move the camera slowly.",
     "participating_media": "Wait for clear air: haze, smoke and water are taken for parts of the scene.",
     "transients": "Mask out what moves, or leave out the photos that show it.",
     "vignetting": "Close the aperture, or correct the vignetting before ingest.",
-    "scale": "Keep a similar distance, or add photos at the distances in between.",
+    "scale_variation": "Keep a similar distance, or add photos at the distances in between.",
 }
 
 

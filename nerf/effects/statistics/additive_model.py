@@ -2,7 +2,7 @@
 
 The points' parts are eliminated, which leaves the Laplacian of the graph of photos that share points:
 A = diag(sum w) - sum over points of w w^T / sum(w), as in a bundle adjustment of one number per photo (Schur
-complement). In statistics it is the two-way layout, and slopes between what it leaves are Frisch, Waugh and Lovell's.
+complement). Slopes between what it leaves are Frisch, Waugh and Lovell's.
 
 Nothing here asks BLAS, whose sums differ in their last digits by the number of its threads and by the processor: what
 is trained begins with these gains, and the same photos are to give the same field.
@@ -20,7 +20,7 @@ EXACT = 1e-12  # of a residual, beside the right-hand side
 
 
 @dataclass(frozen=True)
-class TwoWay:
+class AdditiveModel:
     """Which photo and which point each of m observations is of, in order of point, and all pairs of one point.
 
     ``main``: the photos of the largest connected part of the graph; of the others nothing is known beside them.
@@ -118,7 +118,7 @@ class TwoWay:
         return slope, float(np.sqrt(variance)) / size
 
 
-def two_way(view: Int[np.ndarray, "m"], point: Int[np.ndarray, "m"], views: int) -> TwoWay:
+def additive_model(view: Int[np.ndarray, "m"], point: Int[np.ndarray, "m"], views: int) -> AdditiveModel:
     """The layout of observations that are in order of point (``nerf.effects.statistics.tracks.usable``)."""
     rank, length = within_groups(point)
     of = np.cumsum(rank == 0) - 1
@@ -127,7 +127,7 @@ def two_way(view: Int[np.ndarray, "m"], point: Int[np.ndarray, "m"], views: int)
         for lag in range(1, int(length.max(initial=1)))
     ]
     first, second = np.concatenate(pairs, axis=1) if pairs else np.zeros((2, 0), int)
-    return TwoWay(views, view, of, first, second, _largest_part(view, of, views))
+    return AdditiveModel(views, view, of, first, second, _largest_part(view, of, views))
 
 
 def solved(matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:

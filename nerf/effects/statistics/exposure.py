@@ -10,23 +10,23 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from nerf.effects.statistics.additive_model import TwoWay, two_way
+from nerf.effects.statistics.additive_model import AdditiveModel, additive_model
 from nerf.effects.statistics.statistic import (
-    HARM,
     HUBER,
+    MIN_EFFECT,
+    MIN_SIGNAL_TO_NOISE,
     OF_GAUSSIAN,
-    SURE,
     VALUE_PER_LOG_LIGHT,
     Evidence,
-    judged,
+    classify,
     unknown,
 )
 from nerf.effects.statistics.tracks import TrackColours, log_light, log_noise, usable
 
 EV = float(np.log(2.0))
-# A gain that is off by d in ln(light) makes an error of VALUE_PER_LOG_LIGHT d in sRGB values: HARM is d = 0.034,
+# A gain that is off by d in ln(light) makes an error of VALUE_PER_LOG_LIGHT d in sRGB values: MIN_EFFECT is d = 0.034,
 # 0.05 EV. Called for from twice that, when gains deviate by 0.1 EV.
-THRESHOLD_EV = 2 * HARM / VALUE_PER_LOG_LIGHT / EV
+THRESHOLD_EV = 2 * MIN_EFFECT / VALUE_PER_LOG_LIGHT / EV
 REDESCENDING = 5.0  # in robust deviations: as HUBER loses some 5 % to plain means of normal noise
 HUBER_ROUNDS, MAX_ROUNDS = 8, 30
 CONVERGED = 1e-5  # of a log gain: a tenth of what gains are rounded to where they leave
@@ -43,7 +43,7 @@ class ExposureFit(NamedTuple):
     1.1; times ``brightness_spread`` it is the difference in gain between bright and dark points.
     """
 
-    layout: TwoWay
+    layout: AdditiveModel
     used: Int[np.ndarray, "m"]
     rest: Float[np.ndarray, "m 3"]
     weight: Float[np.ndarray, "m 3"]
@@ -70,7 +70,7 @@ def fit_exposure(tracks: TrackColours) -> ExposureFit:
     """Gains of all photos. Radial darkening is fitted beside them where it is beyond doubt (``vignetting``, ln at the
     corner), for gains of photos that show the same points at their corners would take a part of it."""
     used = usable(tracks)
-    layout = two_way(tracks.view[used], tracks.point[used], tracks.views)
+    layout = additive_model(tracks.view[used], tracks.point[used], tracks.views)
     y, sigma = log_light(tracks.colour[used]), log_noise(tracks.colour[used])
     square = tracks.radius[used] ** 2
     gain, error = np.zeros((tracks.views, 3)), np.full((tracks.views, 3), np.inf)
@@ -80,7 +80,7 @@ def fit_exposure(tracks: TrackColours) -> ExposureFit:
         part = y[:, channel]
         weight[:, channel], noise[channel], given_up = _robust_weights(layout, part, sigma[:, channel])
         slope, slope_error = layout.slope(part, square, weight[:, channel])
-        if abs(slope) > SURE * slope_error:
+        if abs(slope) > MIN_SIGNAL_TO_NOISE * slope_error:
             vignetting[channel] = slope
             part = part - slope * square
             weight[:, channel], noise[channel], given_up = _robust_weights(layout, part, sigma[:, channel])
@@ -97,7 +97,7 @@ def fit_exposure(tracks: TrackColours) -> ExposureFit:
 
 
 def _robust_weights(
-    layout: TwoWay, y: Float[np.ndarray, "m"], sigma: Float[np.ndarray, "m"]
+    layout: AdditiveModel, y: Float[np.ndarray, "m"], sigma: Float[np.ndarray, "m"]
 ) -> tuple[Float[np.ndarray, "m"], float, float]:
     """Converged weights, the robust deviation in units of ``sigma``, and by how much standard errors grow over those of
     fixed weights.
@@ -126,7 +126,7 @@ def _robust_weights(
 
 
 def _contrast(
-    layout: TwoWay, y: Float[np.ndarray, "m 3"], weight: Float[np.ndarray, "m 3"]
+    layout: AdditiveModel, y: Float[np.ndarray, "m 3"], weight: Float[np.ndarray, "m 3"]
 ) -> tuple[Float[np.ndarray, "views"], Float[np.ndarray, "views"], float]:
     """How each photo's brightness, gains removed, rises with that of its points in the other photos: the slope - 1, its
     median 0; its standard error; and the deviation of brightness over a photo's points.
@@ -173,8 +173,8 @@ def exposure_evidence(
     """
     if not fit.known.any():
         return unknown("EV", THRESHOLD_EV, fit.unknown_because, None)
-    plain = fit.known if odd is None else _or_all(fit.known & ~odd, fit.known)
-    counted = _or_all(plain & (fit.error.max(axis=1) < THRESHOLD_EV * EV), plain)
+    plain = fit.known if odd is None else or_all(fit.known & ~odd, fit.known)
+    counted = or_all(plain & (fit.error.max(axis=1) < THRESHOLD_EV * EV), plain)
     gain, error = fit.log_gain[counted] / EV, fit.error[counted] / EV
     noise = float(np.median(error))
     spread = float(np.sqrt(max(np.mean((gain - gain.mean(axis=0)) ** 2) - np.mean(error**2), 0.0)))
@@ -186,10 +186,10 @@ def exposure_evidence(
     left_out += f"; without {strange} photo{'s' * (strange > 1)} with something in the way" if strange else ""
     left_out += f"; {unsure} photos do not count, their gains are not known to {THRESHOLD_EV:.1g} EV" if unsure else ""
     checked = "" if told is None else _beside_told(gain.mean(axis=1), told[counted])
-    return judged(spread, noise, THRESHOLD_EV, "EV", f"gains span {span:.2g} EV, {ratio}{left_out}{checked}")
+    return classify(spread, noise, THRESHOLD_EV, "EV", f"gains span {span:.2g} EV, {ratio}{left_out}{checked}")
 
 
-def _or_all(some: Bool[np.ndarray, "views"], every: Bool[np.ndarray, "views"]) -> Bool[np.ndarray, "views"]:
+def or_all(some: Bool[np.ndarray, "views"], every: Bool[np.ndarray, "views"]) -> Bool[np.ndarray, "views"]:
     """Some of the photos; all where fewer than two are left."""
     return some if np.count_nonzero(some) > 1 else every
 
@@ -202,18 +202,3 @@ def _beside_told(gain: Float[np.ndarray, "known"], told: Float[np.ndarray, "know
     apart = (gain - told)[both]
     apart = np.sqrt(np.mean((apart - apart.mean()) ** 2))
     return f"; EXIF tells of {np.ptp(told[both]):.2g} EV, the gains deviate from it by {apart:.2g}"
-
-
-def tone_evidence(fit: ExposureFit) -> Evidence:
-    """Whether gains alone are not enough: how much photos' gains differ between bright points and dark ones, EV per
-    deviation of brightness. The threshold is that of exposure."""
-    known = fit.known & np.isfinite(fit.contrast_error)
-    if not known.any() or fit.brightness_spread == 0:
-        return unknown("EV", THRESHOLD_EV, fit.unknown_because, False)
-    scale = fit.brightness_spread / EV
-    counted = _or_all(known & (fit.contrast_error * scale < THRESHOLD_EV), known)
-    contrast, error = fit.contrast[counted] * scale, fit.contrast_error[counted] * scale
-    noise = float(np.median(error))
-    spread = float(np.sqrt(max(np.mean(contrast**2) - np.mean(error**2), 0.0)))
-    words = f"gains differ by {spread:.2g} EV between bright and dark points, ± {noise:.1g}"
-    return judged(spread, noise, THRESHOLD_EV, "EV", words)

@@ -3,11 +3,11 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from nerf.effects.statistics.statistic import GREY, HUBER, OF_GAUSSIAN, Evidence, decide, unknown
+from nerf.effects.statistics.statistic import GREY_ZONE, HUBER, OF_GAUSSIAN, Evidence, decide, unknown
 
 PX = "px at 1000"  # pixels of a photo whose longer side has 1000: what a full photo's are depends on the camera
 # An error of d pixels changes values by d times their step from pixel to pixel, which in usual photos at 1000 pixels is
-# 0.03 rms: HARM is 0.3 px, and called for is twice that.
+# 0.03 rms: MIN_EFFECT is 0.3 px, and called for is twice that.
 THRESHOLD_PX = 0.6
 # Refinement is for all photos and takes a third more time. A photo that does not fit costs its own place some 4 dB,
 # however far off it is: over all that is the 1.1 dB of the threshold once so many of the photos are off.
@@ -82,7 +82,7 @@ def pose_evidence(
         common = float(np.sqrt(max(np.quantile(power[known] - expected[known], 1 - OFF), 0.0)))
         noise = float(np.sqrt(np.median(expected[known])))
     called_for = decide(common, noise, THRESHOLD_PX)
-    if called_for is False and uncertain >= THRESHOLD_PX / GREY:
+    if called_for is False and uncertain >= THRESHOLD_PX / GREY_ZONE:
         called_for = None
     off = f"a quarter of the photos are off by {common:.2g} px or more as a whole, ± {noise:.1g}"
     words = f"at 1000 pixels {off}; poses uncertain by {uncertain:.2g} px"

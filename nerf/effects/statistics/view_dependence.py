@@ -10,13 +10,13 @@ of differences over squared texture, and what is compared is where these lines s
 import numpy as np
 from jaxtyping import Float, Int
 
-from nerf.effects.statistics.additive_model import TwoWay
+from nerf.effects.statistics.additive_model import AdditiveModel
 from nerf.effects.statistics.exposure import ExposureFit
-from nerf.effects.statistics.statistic import HARM, Evidence, judged, unknown
+from nerf.effects.statistics.statistic import MIN_EFFECT, Evidence, classify, unknown
 from nerf.effects.statistics.tracks import TrackColours, log_light
 from nerf.rendering.srgb import OFFSET, POWER
 
-THRESHOLD = 2 * HARM  # deviation of colours, sRGB values: a field of diffuse colours has it as its error
+THRESHOLD = 2 * MIN_EFFECT  # deviation of colours, sRGB values: a field of diffuse colours has it as its error
 MIN_PAIRS = 60  # in each of the two ranges of angles
 MIN_SPREAD_DEG = 1.5  # between the two ranges
 LARGEST = 20.0  # medians of squared differences (three deviations), what false matches and passers-by count at most
@@ -54,18 +54,18 @@ def view_dependence_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence
     texture = ((texture[fit.used][first] ** 2 + texture[fit.used][second] ** 2) / 2)[chosen]
     points = fit.layout.point[first][chosen]
     growth, noise = _growth(squared, texture, wide[chosen], points % BATCHES)
-    return _judged(growth, noise, float(np.median(angle[wide])))
+    return _classify(growth, noise, float(np.median(angle[wide])))
 
 
-def _judged(growth: float, noise: float, angle_deg: float) -> Evidence:
+def _classify(growth: float, noise: float, angle_deg: float) -> Evidence:
     """Variances as deviations; two noises more in the one are two more in the other."""
     deviation = float(np.sqrt(max(growth, 0.0)))
     uncertain = (float(np.sqrt(deviation**2 + 2 * noise)) - deviation) / 2
     words = f"colours change by {deviation:.2g} of 1 over {angle_deg:.0f}°, ± {uncertain:.1g}"
-    return judged(deviation, uncertain, THRESHOLD, "sRGB", words)
+    return classify(deviation, uncertain, THRESHOLD, "sRGB", words)
 
 
-def _pairs(layout: TwoWay) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
+def _pairs(layout: AdditiveModel) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
     """Of each point's pairs those of neighbours in the order of photos, and those half its track apart: of each point
     as many as it has observations, or so, near and far ones."""
     length = np.bincount(layout.point)[layout.point[layout.first]]

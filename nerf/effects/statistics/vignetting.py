@@ -3,14 +3,14 @@
 import numpy as np
 
 from nerf.effects.statistics.exposure import EV, ExposureFit
-from nerf.effects.statistics.statistic import HARM, VALUE_PER_LOG_LIGHT, Evidence, judged, unknown
+from nerf.effects.statistics.statistic import MIN_EFFECT, VALUE_PER_LOG_LIGHT, Evidence, classify, unknown
 from nerf.effects.statistics.tracks import TrackColours, log_light
 
 # Light at radius r (half diagonals) is exp(a r^2). Over the pixels of a photo r^2 deviates by some 0.24 from its mean,
-# which gains take up: an error of 0.24 VALUE_PER_LOG_LIGHT a in sRGB values. HARM is a = 0.14, 0.2 EV at the corner;
-# called for from twice that, a quarter of the light there. It is what a field cannot explain at all that harms;
+# which gains take up: an error of 0.24 VALUE_PER_LOG_LIGHT a in sRGB values. MIN_EFFECT is a = 0.14, 0.2 EV there;
+# called for from twice that, a quarter of the light. It is what a field cannot explain at all that harms;
 # photos that always show the same points at the same radius look alike and are not harmed, nor is it measured in them.
-THRESHOLD_EV = 2 * HARM / (0.24 * VALUE_PER_LOG_LIGHT) / EV
+THRESHOLD_EV = 2 * MIN_EFFECT / (0.24 * VALUE_PER_LOG_LIGHT) / EV
 
 
 def vignetting_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence:
@@ -24,4 +24,4 @@ def vignetting_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence:
     if not np.isfinite(noise):
         return unknown("EV", THRESHOLD_EV, "every point lies at one radius in all photos", False)
     words = f"corners are {abs(slope):.2g} EV {'darker' if slope < 0 else 'brighter'} than the middle, ± {noise:.1g}"
-    return judged(float(abs(slope)), float(noise), THRESHOLD_EV, "EV", words)
+    return classify(float(abs(slope)), float(noise), THRESHOLD_EV, "EV", words)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerf.effects import HeldOutImages, Images
 from nerf.effects.exposure import expose, expose_backward
-from nerf.effects.statistics.statistic import Evidence, judged
+from nerf.effects.statistics.statistic import Evidence, classify
 from nerf.geometry.rays import Rays
 
 
@@ -73,4 +73,4 @@ class FalloffModel:
 
 def statistic(seen: object) -> Evidence:
     """What a scene says of it: always enough."""
-    return judged(1.0, 0.1, 0.5, "EV", "photos are darker at their corners")
+    return classify(1.0, 0.1, 0.5, "EV", "photos are darker at their corners")

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.effects import HeldOutImages, Images
-from nerf.effects.statistics.statistic import Evidence, judged
+from nerf.effects.statistics.statistic import Evidence, classify
 from nerf.geometry.rays import Rays
 
 
@@ -61,4 +61,4 @@ class VeilModel:
 
 def statistic(seen: object) -> Evidence:
     """What a scene says of it: always enough."""
-    return judged(1.0, 0.1, 0.5, "of white", "photos are veiled")
+    return classify(1.0, 0.1, 0.5, "of white", "photos are veiled")

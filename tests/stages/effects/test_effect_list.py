@@ -77,7 +77,7 @@ def test_photos_are_rendered_and_scored_through_a_new_effect(trained: dict[str, 
 
     _, level = photo_effects(field, scene, test)
     assert 0 < float(level.rows) <= 0.25, "a test photo is veiled as its neighbours are"
-    chosen = evaluate.Config(downscale=8.0, photos=2)
+    chosen = evaluate.Config(downscale=8.0)
     evaluate.run(chosen, trained, trained["evaluate"], Quiet())
     metrics = read_json(trained["evaluate"] / "metrics.json")
     assert metrics["appearance"] == [ExposureModel.held_out_words, VeilModel.held_out_words]

@@ -71,7 +71,7 @@ def test_clear_evidence_decides_without_a_pilot(decided: Callable) -> None:
         "seen, not modelled: vignetting (one of two)"
     )
     assert table["vignetting"]["seconds"] == 0.5
-    assert table["lens"]["seconds"] == 0.0, "stage sfm chose it"
+    assert table["camera_model"]["seconds"] == 0.0, "stage sfm chose it"
     assert table["exposure"] == {
         "on": False,
         "modelled": True,

@@ -10,7 +10,7 @@ import pytest
 from nerf.effects.statistics.statistic import Evidence
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages.effects.evidence import (
-    lens_evidence,
+    camera_model_evidence,
     observed_places,
     pose_statistic,
     rolling_shutter_statistic,
@@ -123,15 +123,15 @@ def test_lenses_compare_with_their_groups_simplest_sound_one() -> None:
         candidate(1, "SIMPLE_RADIAL", 0.55, chosen=True),
         candidate(1, "OPENCV", 0.54),
     ]
-    found = lens_evidence({"source": "sfm", "camera_models": rows})
+    found = camera_model_evidence({"source": "sfm", "camera_models": rows})
     assert found.statistic == pytest.approx(0.3) and found.called_for is True
     assert found.words == ("OPENCV: held-out error 0.3 px below that of the simplest candidate, SIMPLE_RADIAL: 0.1 px")
-    alone = lens_evidence({"source": "sfm", "camera_models": rows[3:]})
+    alone = camera_model_evidence({"source": "sfm", "camera_models": rows[3:]})
     assert alone.words == "SIMPLE_RADIAL: held-out error 0.1 px below that of the simplest candidate"
 
 
 def test_a_pinhole_is_no_lens() -> None:
-    found = lens_evidence({"source": "sfm", "camera_models": [candidate(0, "PINHOLE", 0.5, chosen=True)]})
+    found = camera_model_evidence({"source": "sfm", "camera_models": [candidate(0, "PINHOLE", 0.5, chosen=True)]})
     assert found.called_for is False and found.statistic == 0
 
 
@@ -144,6 +144,6 @@ def test_a_pinhole_is_no_lens() -> None:
     ],
 )
 def test_why_nothing_is_known_of_the_lens(source: str, rows: list[dict[str, Any]], why: str) -> None:
-    found = lens_evidence({"source": source, "camera_models": rows})
+    found = camera_model_evidence({"source": source, "camera_models": rows})
     assert found.words == f"{why}: nothing known" and found.called_for is False
     assert np.isinf(found.noise) and np.isinf(found.threshold)

@@ -3,13 +3,11 @@
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
 import stages.effects.track_colours
-from nerf.effects.statistics import transients
 from nerf.effects.statistics.exposure import EV, fit_exposure
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages.effects.evidence import training_residuals
@@ -18,7 +16,7 @@ from stages.effects.track_colours import (
     BRIGHTEST,
     CLIPPED_SHARE,
     DARKEST,
-    MOST,
+    MAX_OBSERVATIONS,
     _expected,
     _window_means,
     _windows,
@@ -104,7 +102,7 @@ def test_colours_are_those_of_the_photos(tmp_path: Path, progress: SilentProgres
 
 def test_geometry_is_that_of_the_cameras(tmp_path: Path, progress: SilentProgress) -> None:
     scene, points = photographed_points(tmp_path)
-    tracks, xy = training_tracks(scene, points, MOST)
+    tracks, xy = training_tracks(scene, points, MAX_OBSERVATIONS)
     view = scene.of_split("train")[tracks.view[7]]
     offset = view.scene_from_camera[:, 3] - points["xyz"][tracks.point[7]]
     np.testing.assert_allclose(tracks.distance[7], np.linalg.norm(offset))
@@ -196,7 +194,7 @@ def test_windows_are_summed_as_if_each_were_looked_at() -> None:
 
 def test_fewer_observations_are_whole_tracks(tmp_path: Path, progress: SilentProgress) -> None:
     scene, points = photographed_points(tmp_path)
-    all_of_them, some = training_tracks(scene, points, MOST)[0], training_tracks(scene, points, 60)[0]
+    all_of_them, some = training_tracks(scene, points, MAX_OBSERVATIONS)[0], training_tracks(scene, points, 60)[0]
     assert 30 < len(some) < 75 < len(all_of_them)
     lengths = np.bincount(all_of_them.point, minlength=POINTS)
     kept = np.bincount(some.point, minlength=POINTS)
@@ -205,7 +203,7 @@ def test_fewer_observations_are_whole_tracks(tmp_path: Path, progress: SilentPro
 
 def test_near_photos_have_larger_windows(tmp_path: Path, progress: SilentProgress) -> None:
     scene, points = photographed_points(tmp_path)
-    tracks = training_tracks(scene, points, MOST)[0]
+    tracks = training_tracks(scene, points, MAX_OBSERVATIONS)[0]
     near = replace(tracks, footprint=np.where(tracks.view == 0, 0.5, 1.0) * 0.03)
     window = _windows(scene, near)
     paired = np.isin(near.point, near.point[near.view > 0])
@@ -237,7 +235,7 @@ def test_only_photos_nearby_are_asked_what_should_be_seen(monkeypatch: pytest.Mo
         "point": np.repeat(np.arange(each), 5),
         "xy": np.zeros((5 * each, 2)),
     }
-    tracks = training_tracks(scene, points, MOST)[0]
+    tracks = training_tracks(scene, points, MAX_OBSERVATIONS)[0]
     tracks = replace(tracks, point=2 * tracks.point)  # as where every second point was drawn
     points["xyz"] = points["xyz"].repeat(2, axis=0)
 
@@ -246,7 +244,7 @@ def test_only_photos_nearby_are_asked_what_should_be_seen(monkeypatch: pytest.Mo
         return set(zip(expected.view.tolist(), expected.point.tolist(), strict=True))
 
     near = pairs()
-    monkeypatch.setattr(transients, "NEAR_APART", 100.0)
+    monkeypatch.setattr(stages.effects.track_colours, "NEAR_APART", 100.0)
     assert pairs() == near and len(near) > 1000
     monkeypatch.setattr(stages.effects.track_colours, "MAX_LOOKED_AT", 300 * count)
     some = pairs()
@@ -260,16 +258,6 @@ def test_without_points_only_the_photos_are_looked_at(tmp_path: Path, progress: 
     scene, points = photographed_points(tmp_path)
     looked = look_at_photos(tmp_path, scene, without_points(points), progress)
     assert len(looked.tracks) == len(looked.expected) == 0 and looked.tracks.views == 6
-    assert looked.gradients.shape == (6, 2, 2) and (np.linalg.eigvalsh(looked.gradients) > 0).all()
-
-
-def test_gradients_are_thinned_by_a_smear_across_it_alone(tmp_path: Path, progress: SilentProgress) -> None:
-    scene, points = photographed_points(tmp_path)
-    sharp = look_at_photos(tmp_path, scene, without_points(points), progress).gradients[0]
-    with Image.open(tmp_path / "images/1.png") as image:
-        write_png(tmp_path / "images/1.png", cv2.blur(np.asarray(image), (9, 1)))
-    smeared = look_at_photos(tmp_path, scene, without_points(points), progress).gradients[0]
-    assert smeared[0, 0] < 0.3 * sharp[0, 0] and smeared[1, 1] > 0.5 * sharp[1, 1]
 
 
 def test_all_evidence_of_a_scene(tmp_path: Path, progress: SilentProgress) -> None:
@@ -277,7 +265,7 @@ def test_all_evidence_of_a_scene(tmp_path: Path, progress: SilentProgress) -> No
     scene, points = photographed_points(tmp_path, gain)
     found = scene_evidence(tmp_path, scene, points, {"images/1.png": None, "images/2.png": 0.1}, progress)
     assert set(found.of) == {
-        *("exposure", "tone", "view_dependence", "vignetting", "transients", "scale", "participating_media", "blur"),
+        *("exposure", "tone", "view_dependence", "vignetting", "transients", "scale_variation", "participating_media"),
         *("background", "pose_refinement", "rolling_shutter"),
     }
     assert found.of["exposure"].called_for is True

@@ -62,8 +62,8 @@ EFFECTS = {
         True, "gains span 0.8 EV", statistic=0.8, threshold=0.05, noise=0.016, unit="EV", seconds=2.5, cost=0.04
     ),
     "view_dependence": effect(True, "it pays", pilot_gain_db=0.94, pilot_noise_db=0.21, seconds=0.02),
-    "blur": effect(True, "<i>smeared</i>", modelled=False, statistic=4.0, threshold=2.5, unit="px"),
-    "tone": effect(False, "none seen", modelled=False),
+    "tone": effect(True, "<i>smeared</i>", modelled=False, statistic=4.0, threshold=2.5, unit="px"),
+    "transients": effect(False, "none seen", modelled=False),
 }
 
 
@@ -97,8 +97,8 @@ def test_page_shows_what_the_photos_call_for(tmp_path: Path, progress: Any):
     ]
     flags = re.findall(r"<li>(.*?)</li>", section)
     assert flags == [
-        "blur: &lt;i&gt;smeared&lt;/i&gt; (4 px, threshold 2.5 px). Hold the camera still, lock the focus, give more "
-        "light, and leave blurred photos out."
+        "tone: &lt;i&gt;smeared&lt;/i&gt; (4 px, threshold 2.5 px). Turn off automatic contrast, HDR and filters, or "
+        "develop all photos with one curve."
     ]
 
 

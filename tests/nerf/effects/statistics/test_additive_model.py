@@ -6,18 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerf.effects.statistics.additive_model import TwoWay, inverted, solved, two_way
+from nerf.effects.statistics.additive_model import AdditiveModel, additive_model, inverted, solved
 
 
-def drawn(seed: int, views: int = 7, points: int = 40) -> tuple[TwoWay, np.ndarray]:
+def drawn(seed: int, views: int = 7, points: int = 40) -> tuple[AdditiveModel, np.ndarray]:
     """A layout in which some photos see a point twice, and weights."""
     draw = np.random.default_rng(seed)
     point = np.sort(draw.integers(0, points, 200))
-    layout = two_way(draw.integers(0, views, 200), point, views)
+    layout = additive_model(draw.integers(0, views, 200), point, views)
     return layout, draw.uniform(0.1, 3, 200)
 
 
-def slow_fit(layout: TwoWay, y: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def slow_fit(layout: AdditiveModel, y: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Gains and what is left, by least squares over a design matrix with a column per photo and per point."""
     points = layout.point.max() + 1
     design = np.concatenate([np.eye(layout.views)[layout.view], np.eye(points)[layout.point]], axis=1)
@@ -68,7 +68,7 @@ def test_the_slope_is_that_of_least_squares_with_its_error() -> None:
 def test_slopes_of_single_photos_are_no_common_slope() -> None:
     """Light from one side: what a photo has in common is one draw, however many of its points show it."""
     draw = np.random.default_rng(8)
-    layout, weight = two_way(draw.integers(0, 20, 2000), np.repeat(np.arange(400), 5), 20), np.ones(2000)
+    layout, weight = additive_model(draw.integers(0, 20, 2000), np.repeat(np.arange(400), 5), 20), np.ones(2000)
     x, off = draw.normal(size=2000), []
     for _ in range(100):
         y = draw.normal(size=20)[layout.view] * x + 0.1 * draw.normal(size=2000)
@@ -86,14 +86,14 @@ def test_no_slope_over_what_belongs_to_photos() -> None:
 def test_the_largest_part_of_the_graph() -> None:
     view = np.array([0, 1, 1, 2, 4, 5, 3])
     point = np.array([0, 0, 1, 1, 2, 2, 3])
-    np.testing.assert_array_equal(two_way(view, point, 6).main, [True, True, True, False, False, False])
-    assert not two_way(np.zeros(0, int), np.zeros(0, int), 3).main.any()
-    assert not two_way(np.array([0, 1]), np.array([0, 1]), 2).main.any()
+    np.testing.assert_array_equal(additive_model(view, point, 6).main, [True, True, True, False, False, False])
+    assert not additive_model(np.zeros(0, int), np.zeros(0, int), 3).main.any()
+    assert not additive_model(np.array([0, 1]), np.array([0, 1]), 2).main.any()
 
 
 @pytest.mark.parametrize("length", [2, 3, 10])
 def test_all_pairs_of_a_point_are_there_once(length: int) -> None:
-    layout = two_way(np.tile(np.arange(length), 2), np.repeat([0, 1], length), length)
+    layout = additive_model(np.tile(np.arange(length), 2), np.repeat([0, 1], length), length)
     pairs = set(zip(layout.first.tolist(), layout.second.tolist(), strict=True))
     assert len(pairs) == len(layout.first) == length * (length - 1)
     assert all(a < b and (a < length) == (b < length) for a, b in pairs)

@@ -1,11 +1,11 @@
-"""Vignetting, view dependence, transients and media: each is found in tracks that have it, and not in others."""
+"""Vignetting, view dependence, transients and participating media: found where they are."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from nerf.effects.statistics import media, transients, view_dependence, vignetting
+from nerf.effects.statistics import outlier_images, view_dependence, vignetting, warnings
 from nerf.effects.statistics.exposure import EV, fit_exposure
 from nerf.effects.statistics.statistic import Evidence
 from nerf.effects.statistics.tracks import TrackColours
@@ -113,7 +113,7 @@ def passed_by(seed: int, share: float, photos: int = 2) -> tuple[TrackColours, T
 
 def passers_by(tracks: TrackColours, expected: TrackColours | None) -> Evidence:
     fit = fit_exposure(tracks)
-    return transients.transients_evidence(transients.odd_photos(tracks, fit, expected), fit)
+    return warnings.transients_evidence(outlier_images.outlier_images(tracks, fit, expected), fit)
 
 
 def test_a_passer_by_in_few_photos_is_seen() -> None:
@@ -139,7 +139,7 @@ def test_expected_places_are_those_that_two_near_photos_see() -> None:
         view, point = np.array(seen).T
         offset = centres[view] - position[point]
         length = np.linalg.norm(offset, axis=1)
-        found = transients.expected_places(offset / length[:, None], length, point, np.array(centre), position)
+        found = outlier_images.expected_places(offset / length[:, None], length, point, np.array(centre), position)
         return found.tolist()
 
     assert places([(0, 0), (1, 0), (0, 1)], [3, -0.2, 0]) == [0]
@@ -155,11 +155,11 @@ def test_photos_that_show_a_point_alike_are_near_each_other() -> None:
 
     def alike(k: int) -> bool:
         twice = there[[k, k]] / distance[k], distance[[k, k]], np.zeros(2, int)
-        return len(transients.expected_places(*twice, here[k], np.zeros((1, 3)))) == 1
+        return len(outlier_images.expected_places(*twice, here[k], np.zeros((1, 3)))) == 1
 
     apart = np.linalg.norm(there - here, axis=1) / distance
     farthest = max(apart[k] for k in range(2000) if alike(k))
-    assert 0.9 * transients.NEAR_APART < farthest <= transients.NEAR_APART
+    assert 0.9 * outlier_images.NEAR_APART < farthest <= outlier_images.NEAR_APART
 
 
 def hazy(seed: int, per_unit: float) -> TrackColours:
@@ -174,8 +174,8 @@ def hazy(seed: int, per_unit: float) -> TrackColours:
 def test_fog_is_seen_and_clear_air_is_not() -> None:
     for seed in SEEDS:
         fog, clear = hazy(seed, 0.5), hazy(seed, 0.0)
-        assert media.media_evidence(fog, fit_exposure(fog)).called_for is True
-        assert media.media_evidence(clear, fit_exposure(clear)).called_for is False
+        assert warnings.participating_media_evidence(fog, fit_exposure(fog)).called_for is True
+        assert warnings.participating_media_evidence(clear, fit_exposure(clear)).called_for is False
 
 
 def test_without_tracks_nothing_is_known() -> None:
@@ -186,7 +186,7 @@ def test_without_tracks_nothing_is_known() -> None:
         (view_dependence.view_dependence_evidence(none, fit), None),
         (passers_by(none, none), False),
         (passers_by(none, None), False),
-        (media.media_evidence(none, fit), False),
+        (warnings.participating_media_evidence(none, fit), False),
     ):
         assert found.called_for is decided and found.words.endswith(": nothing known")
         assert found.statistic == 0 and np.isinf(found.noise)

@@ -3,8 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerf.effects.statistics.exposure import EV, THRESHOLD_EV, exposure_evidence, fit_exposure, tone_evidence
+from nerf.effects.statistics.exposure import EV, THRESHOLD_EV, exposure_evidence, fit_exposure
 from nerf.effects.statistics.tracks import TrackColours
+from nerf.effects.statistics.warnings import tone_evidence
 from tests.nerf.effects.statistics.photographed_points import photographed_points
 
 SEEDS = range(20)

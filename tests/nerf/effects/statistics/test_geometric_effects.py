@@ -1,4 +1,4 @@
-"""Scale, background, poses, rolling shutter and blur."""
+"""Scale variation, background, poses and rolling shutter."""
 
 from dataclasses import replace
 
@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from nerf.effects.statistics.background import background_evidence, untracked_share
-from nerf.effects.statistics.blur import blur_evidence, relative_gradients
 from nerf.effects.statistics.poses import common_residuals, pose_evidence
-from nerf.effects.statistics.rolling_shutter import across_rows, motion_to_next, rolling_shutter_evidence
-from nerf.effects.statistics.scale import scale_evidence
 from nerf.effects.statistics.tracks import TrackColours
+from nerf.effects.statistics.warnings import (
+    across_rows,
+    motion_to_next,
+    rolling_shutter_evidence,
+    scale_variation_evidence,
+)
 from tests.nerf.effects.statistics.photographed_points import photographed_points
 
 SEEDS = range(20)
@@ -22,7 +25,7 @@ def test_the_ratio_of_footprints(ratio: float, called_for: bool | None) -> None:
         tracks = photographed_points(seed)
         near = tracks.view < 6  # every point is seen by five photos in a row: some by both kinds, some by one
         tracks = replace(tracks, footprint=np.where(near, 1.0, ratio))
-        found = scale_evidence(tracks)
+        found = scale_variation_evidence(tracks)
         assert found.statistic == pytest.approx(ratio) and found.called_for is called_for
 
 
@@ -34,7 +37,7 @@ def test_far_and_near_photos_are_compared_through_others() -> None:
             tracks.view + 4 > tracks.point * 0 + np.repeat(tracks.view[::4], 4)
         )  # none from last to first
         point_size = np.random.default_rng(seed).uniform(0.5, 2, walk.point.max() + 1)[walk.point]
-        found = scale_evidence(replace(walk, footprint=point_size * 6.0 ** (walk.view / 29)))
+        found = scale_variation_evidence(replace(walk, footprint=point_size * 6.0 ** (walk.view / 29)))
         assert found.called_for is True and 4.5 < found.statistic < 6
         assert found.words.startswith("pixels at the same points differ 1.2-fold in size, by way of other photos ")
 
@@ -43,8 +46,8 @@ def test_a_few_false_points_are_no_scale() -> None:
     tracks = photographed_points(0)
     footprint = np.ones(len(tracks))
     footprint[:30:5] = 50
-    assert 1 <= scale_evidence(replace(tracks, footprint=footprint)).statistic < 1.2
-    assert scale_evidence(TrackColours.empty(2)).words == "no tracks: nothing known"
+    assert 1 <= scale_variation_evidence(replace(tracks, footprint=footprint)).statistic < 1.2
+    assert scale_variation_evidence(TrackColours.empty(2)).words == "no tracks: nothing known"
 
 
 @pytest.mark.parametrize("share", [0.0, 0.008, 0.05])
@@ -161,35 +164,3 @@ def test_the_motion_of_a_video() -> None:
 def test_rows_follow_each_other_along_the_shorter_side() -> None:
     xy, size = np.array([[3.0, 1.0], [3.0, 1.0]]), np.array([[4.0, 2.0], [4.0, 8.0]])
     np.testing.assert_allclose(across_rows(xy, size), [0.5, 0.75])
-
-
-def tensors(seed: int, views: int = 20) -> np.ndarray:
-    """Structure tensors of a slowly changing view with more texture along one axis."""
-    draw = np.random.default_rng(seed)
-    size = 1 + 0.1 * draw.normal(size=(views, 1, 1))
-    return size * np.array([[3.0, 0.5], [0.5, 1.0]])
-
-
-def test_sharp_photos_are_not_blurred() -> None:
-    for seed in SEEDS:
-        found = blur_evidence(tensors(seed))
-        assert found.called_for is False and found.statistic == 0
-    np.testing.assert_allclose(relative_gradients(tensors(0)), 1, atol=0.3)
-
-
-def test_motion_and_defocus_are_told_apart() -> None:
-    for seed in SEEDS:
-        blurred = tensors(seed)
-        angle = np.random.default_rng(seed).uniform(0, np.pi)
-        along = np.array([np.cos(angle), np.sin(angle)])
-        smear = np.eye(2) - 0.8 * np.outer(along, along)  # a fifth of the amplitude along the motion
-        blurred[4] = smear @ blurred[4] @ smear
-        blurred[12] *= 0.1
-        found = blur_evidence(blurred)
-        assert found.called_for is True
-        assert found.words == "2 of 20 photos are blurred beside their neighbours, 1 by motion, 1 out of focus"
-
-
-def test_few_photos_cannot_be_compared() -> None:
-    for found in (blur_evidence(tensors(0, 3)), blur_evidence(np.zeros((9, 2, 2))), blur_evidence(np.zeros((0, 2, 2)))):
-        assert found.called_for is False and found.words == "too few photos to compare: nothing known"

@@ -4,14 +4,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.effects.statistics.statistic import HARM, decide, judged, unknown
+from nerf.effects.statistics.statistic import MIN_EFFECT, classify, decide, unknown
 
 INFINITE = float("inf")
 
 
 def test_the_minimum_effect_is_three_tenths_of_a_decibel() -> None:
-    assert abs(-10 * log10(1e-3 + HARM**2) - 29.7) < 0.005
-    assert abs(-10 * log10(1e-3 + (2 * HARM) ** 2) - 28.9) < 0.05
+    assert abs(-10 * log10(1e-3 + MIN_EFFECT**2) - 29.7) < 0.005
+    assert abs(-10 * log10(1e-3 + (2 * MIN_EFFECT) ** 2) - 28.9) < 0.05
 
 
 @pytest.mark.parametrize(
@@ -29,7 +29,7 @@ def test_the_minimum_effect_is_three_tenths_of_a_decibel() -> None:
 )
 def test_the_rule(statistic: float, noise: float, called_for: bool | None) -> None:
     assert decide(statistic, noise, 1.0) is called_for
-    assert judged(statistic, noise, 1.0, "EV", "words").called_for is called_for
+    assert classify(statistic, noise, 1.0, "EV", "words").called_for is called_for
 
 
 @given(st.floats(0, 1e6), st.floats(0, 1e6), st.floats(1e-6, 1e6))

@@ -1,4 +1,4 @@
-"""Whether something stood in some photos only: points that single photos show in another colour than the others do.
+"""Outlier images, in which something stood that the others lack: they show points in another colour than these do.
 
 Features are matched by how they look, so what stands before a point rarely has its observation: an observed outlier is
 a highlight or a false match. A passer-by shows where points are *expected*: photos taken from nearly the same direction
@@ -11,24 +11,19 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from nerf.effects.statistics.exposure import ExposureFit
-from nerf.effects.statistics.statistic import OF_GAUSSIAN, Evidence, judged, unknown
+from nerf.effects.statistics.statistic import MIN_SIGNAL_TO_NOISE, OF_GAUSSIAN
 from nerf.effects.statistics.tracks import TrackColours
 from nerf.rendering.srgb import linear_light, srgb_values
 
 OUTLIER = 0.1  # sRGB value, rms of the channels: ten times what a good photo is off by
 MIN_POINTS = 20  # in a photo, for a share of them to mean something
-SURE = 5.0  # robust deviations over what the other photos have
 MIN_EXCESS = 0.05  # of a photo's points: less is an edge that is missed by a pixel
-# A share q of all pixels showing something else, by some 0.3, adds 0.09 q to the squared error where the field has it
-# right, and as much again where it is led astray: 0.15 % of them would be 1.1 dB. Points are no pixels, and
-# surfaces that hide each other are expected wrongly: one percent of all points is beyond doubt.
-THRESHOLD = 0.01
 NEAR_DEG, NEAR_RATIO = 10.0, 1.3  # photos so close to each other hide the same points, but for few
 # Cosine law: two such photos are no farther from each other than by this part of either's distance to the point.
 NEAR_APART = float(np.sqrt(1 + NEAR_RATIO**2 - 2 * NEAR_RATIO * np.cos(np.radians(NEAR_DEG))))
 
 
-class Odd(NamedTuple):
+class OutlierImages(NamedTuple):
     """Of each photo (views,): the share of its points that it shows in another colour ``beyond`` what is usual for a
     photo; that share's ``variance``; whether it is ``much`` more than in the others (robust z). ``seen``: whether
     enough points are looked at in it; the rest is 0 where not."""
@@ -39,9 +34,9 @@ class Odd(NamedTuple):
     seen: Bool[np.ndarray, "views"]
 
 
-def odd_photos(tracks: TrackColours, fit: ExposureFit, expected: TrackColours | None) -> Odd:
+def outlier_images(tracks: TrackColours, fit: ExposureFit, expected: TrackColours | None) -> OutlierImages:
     """Which photos show points in another colour than the others do. ``expected``: where photos should show points that
-    they have no observation of, its ``point`` numbered like that of ``tracks``. Of fewer than three none is odd."""
+    they have no observation of, its ``point`` numbered like that of ``tracks``. Of fewer than three none is one."""
     looked = tracks if expected is None else _together(tracks, expected)
     known = fit.known[looked.view] & np.isin(looked.point, tracks.point[fit.used])
     looked = looked.only(known)
@@ -49,30 +44,16 @@ def odd_photos(tracks: TrackColours, fit: ExposureFit, expected: TrackColours | 
     points = np.bincount(looked.view, minlength=looked.views)
     seen, none = points >= MIN_POINTS, np.zeros(looked.views)
     if np.count_nonzero(seen) < 3:
-        return Odd(none, none, none > 0, none > 0)
+        return OutlierImages(none, none, none > 0, none > 0)
     points = np.where(seen, points, 1)
     share = np.bincount(looked.view, outlier, looked.views) / points
     usual = float(np.median(share[seen]))
     deviation = OF_GAUSSIAN * float(np.median(np.abs(share - usual)[seen]))
     count_noise = np.sqrt(np.maximum(usual * (1 - usual), 1 / points) / points)
     beyond, variance = np.where(seen, share - usual, 0.0), np.where(seen, deviation**2 + count_noise**2, 0.0)
-    return Odd(beyond, variance, (beyond > SURE * np.sqrt(variance)) & (beyond > MIN_EXCESS), seen)
-
-
-def transients_evidence(odd: Odd, fit: ExposureFit) -> Evidence:
-    """The share of all points that photos show in another colour beyond what is usual for a photo, of those photos only
-    where it is much more than in the others."""
-    if not fit.known.any():
-        return unknown("share", THRESHOLD, fit.unknown_because, False)
-    photos = int(np.count_nonzero(odd.seen))
-    if not photos:
-        return unknown("share", THRESHOLD, "too few photos with enough points", False)
-    found = float(np.sum(odd.beyond[odd.much]) / photos)
-    # where no photo is odd, one could have been overlooked
-    variance = np.sum(odd.variance[odd.much]) if odd.much.any() else np.mean(odd.variance[odd.seen])
-    noise = float(np.sqrt(variance)) / photos
-    words = f"{odd.much.sum()} of {photos} photos show {found:.1%} of all points in another colour than the others"
-    return judged(found, noise, THRESHOLD, "share", words)
+    return OutlierImages(
+        beyond, variance, (beyond > MIN_SIGNAL_TO_NOISE * np.sqrt(variance)) & (beyond > MIN_EXCESS), seen
+    )
 
 
 def _together(one: TrackColours, other: TrackColours) -> TrackColours:
