@@ -148,12 +148,8 @@ def _from_transforms(
     if repeated:
         notes.append(Note("sfm.repeated-frames", f"{len(repeated)} frames are listed twice, alike: {_few(repeated)}"))
     if approximate:
-        notes.append(
-            Note(
-                "sfm.approximate-cameras",
-                f"the camera models of {approximate} frames are approximations, as their notes in the file say",
-            )
-        )
+        words = f"the camera models of {approximate} frames are approximations, as their notes in the file say"
+        notes.append(Note("sfm.approximate-cameras", words))
     if not framed:
         raise _nothing_matches(splits[0][0], absent, photos)
     notes += _contradictions([content for _, content in splits], framed)
@@ -165,16 +161,12 @@ def _from_transforms(
     unposed = [photo.name for photo in photos if photo.image_name not in framed.keys() | unused.keys()]
     kept_tests = sorted(set(test_files) - left_out.keys())
     if test_files and not kept_tests:
-        notes.append(
-            Note("sfm.tests-left-out", "all official test photos are among those left out, so others are held out")
-        )
+        words = "all official test photos are among those left out, so others are held out"
+        notes.append(Note("sfm.tests-left-out", words))
     if unused:
         names = _few(sorted(photo.name for photo in unused.values()))
-        notes.append(
-            Note(
-                "sfm.in-no-split", f"{len(unused)} photos are neither to train nor to test on and are left out: {names}"
-            )
-        )
+        words = f"{len(unused)} photos are neither to train nor to test on and are left out: {names}"
+        notes.append(Note("sfm.in-no-split", words))
     return ImportedPoses(
         model=SparseModel.without_points(*distinct(kept)),
         left_out=left_out | dict.fromkeys(unused, "the transforms file has it neither to train nor to test on"),
