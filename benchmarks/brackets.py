@@ -24,7 +24,7 @@ from stages.ingest import conversion
 from stages.io.files import read_json
 
 STOPS, FOLDS, WIDTH = (0, -2, 2), 3, 320
-SMALL_STEPS = ("--train.downscale", "1", "--train.batch-samples", "8192")
+SMALL_STEPS = ("--train.downscale", "1", "--train.grid.target-samples", "8192")
 EFFECTS = ("--effect", "view_dependence=on", "--effect", "background=on")
 FIGURES = ("psnr", "ssim", "psnr_right_half", "psnr_exposure_fitted")
 

@@ -60,6 +60,9 @@ SFM_AND_INGEST: dict[str, str] = {
 }
 
 TRAINING: dict[str, str] = {
+    r"\bpaper('s)? fields?\b|--train\.field paper|_ONLY\b": "vanilla NeRF, --train.field vanilla",
+    r"\b(log2_rows|batch_samples)\b": "log2_hashmap_size, target_samples",
+    r"--train\.(log2-rows|finest|levels|chunks|batch-samples|ray-samples)\b": "--train.grid.*",
     r"\b(load_)?[Pp]ainter\b": "Renderer",
     r"\bpsnr_(right|fitted_right|posed_right)\b": "psnr_right_half, psnr_exposure_fitted, psnr_pose_fitted",
     r"\bparts\.json\b|\b(floor_share|most_rays_per_second|steps_timed)\b": "profile.json, efficiency, profiled steps",

@@ -47,8 +47,8 @@ def background_backward(
     """Gradient of the table, given the colours it was seen in and theirs."""
     features, unit = _features_backward(colour, grad), _on_sphere(directions)
     grad_table = grad.new_zeros(BACKGROUND_LAYOUT.rows, BACKGROUND_LAYOUT.features)
-    for level in range(len(BACKGROUND_LAYOUT.resolutions)):
-        backend.encode_backward_table(BACKGROUND_LAYOUT, level, unit, features, grad_table)
+    levels = range(len(BACKGROUND_LAYOUT.resolutions))
+    backend.encode_backward_table(BACKGROUND_LAYOUT, levels, unit, features, grad_table)
     return grad_table
 
 

@@ -227,7 +227,7 @@ class HashGridField(nn.Module):
         density = self._density_pass(unit.clamp(0, 1))
         ray_hidden = mlp.direction_hidden(self.weights, self.encode_directions(directions.reshape(-1, 3).contiguous()))
         each = torch.arange(len(unit), dtype=torch.int32, device=unit.device)  # a ray of its own for every point
-        colour = mlp.colour_of(self.weights, each, density.geometry_features, ray_hidden)
+        colour = mlp.colour_of(self.weights, self.backend, each, density.geometry_features, ray_hidden)
         return torch.where(sampled, density.sigma, 0).view(points.shape[:-1]), colour.view(points.shape)
 
     def _to_unit(self, points: Float[Tensor, "*points 3"]) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
@@ -254,8 +254,8 @@ class HashGridField(nn.Module):
             with span("composite"):
                 samples = _in_scene(mapped, samples)
                 selected = backend.select_colour_samples(samples, density.sigma, OPACITY_STEP, depth, accumulated)
-                geometry_features = density.geometry_features.index_select(0, selected.rows)
-            colour = mlp.colour_of(self.weights, selected.samples.ray, geometry_features, ray_hidden)
+                geometry_features = backend.gather_rows(density.geometry_features, selected.rows)
+            colour = mlp.colour_of(self.weights, backend, selected.samples.ray, geometry_features, ray_hidden)
             with span("composite"):
                 backend.accumulate_colours(selected, colour, rendered)
         transmittance, opacity = (each.to(rendered.dtype) for each in (torch.exp(-depth), -torch.expm1(-depth)))
@@ -283,8 +283,11 @@ class HashGridField(nn.Module):
             )
             rows = order.index_select(0, seen)
             points = torch.cat([each.points for each in rounds]).index_select(0, rows)
-            of_rounds = zip(*(each.density for each in rounds), strict=True)
-            density = DensityPass(*(torch.cat(parts).index_select(0, rows) for parts in of_rounds))
+            features, geometry_features = (
+                backend.gather_rows(torch.cat(of_rounds), rows)
+                for of_rounds in zip(*(each.density[:2] for each in rounds), strict=True)
+            )
+            density = DensityPass(features, geometry_features, sigma.index_select(0, seen))
             optical_thickness = density.sigma * marched.dt.index_select(0, seen)
         with span("encode"):
             harmonics = self.encode_directions(rays.directions)

@@ -145,6 +145,7 @@ def colour_forward(
 
 def colour_of(
     weights: Weights,
+    backend: Backend,
     ray: Int32[Tensor, "samples"],
     geometry_features: Float[Tensor, "samples geometry_features"],
     ray_hidden: Float[Tensor, "rays hidden"],
@@ -153,7 +154,7 @@ def colour_of(
     with span("mlp", WorkCounts(matmul_flops=colour_flops(weights) * len(geometry_features))):
         logits = geometry_features.new_empty(len(geometry_features), 3)
         for rows in _blocks(geometry_features):
-            hidden = ray_hidden.index_select(0, ray[rows]).addmm_(
+            hidden = backend.gather_rows(ray_hidden, ray[rows]).addmm_(
                 geometry_features[rows], weights.colour_hidden[:GEOMETRY_FEATURES]
             )
             torch.mm(hidden.relu_(), weights.colour_out.T, out=logits[rows])

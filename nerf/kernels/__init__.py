@@ -154,7 +154,7 @@ class Backend(Protocol):
     def encode_backward_table(
         self,
         layout: GridLayout,
-        level: int,
+        levels: range,
         points: Float[Tensor, "points 3"],
         grad_features: Float[Tensor, "points width"],
         grad_table: Float[Tensor, "rows features"],
@@ -167,6 +167,10 @@ class Backend(Protocol):
         points: Float[Tensor, "points 3"],
         grad_features: Float[Tensor, "points width"],
     ) -> Float[Tensor, "points 3"]: ...
+
+    def gather_rows(
+        self, values: Float[Tensor, "rows width"], rows: Int32[Tensor, "chosen"]
+    ) -> Float[Tensor, "chosen width"]: ...
 
     def spherical_harmonics(self, directions: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 16"]: ...
 

@@ -18,9 +18,10 @@ from nerf.runtime.profiler import span
 
 EARLY_STOP_TRANSMITTANCE = 1e-3  # below it the rest of a ray is left out
 # Samples whose densities are computed at once, in all, and per ray (docs/experiments/early_termination.md). A GPU waits
-# for the host after each round, and works on a million samples as long as on a few.
+# for the host after each round, and works on a million samples as long as on a few: the few rays that are long take
+# few rounds there (docs/experiments/gpu.md).
 ROUND_SAMPLES = {"cpu": 1 << 14, "cuda": 1 << 20}
-MIN_ROUND_SAMPLES_PER_RAY, MAX_ROUND_SAMPLES_PER_RAY = 6, 64
+MIN_ROUND_SAMPLES_PER_RAY, MAX_ROUND_SAMPLES_PER_RAY = 6, {"cpu": 64, "cuda": 256}
 
 
 class MarchingRound(NamedTuple):
@@ -66,4 +67,5 @@ def march_with_early_termination(
 
 def _samples_per_ray(rays: int, device: torch.device) -> int:
     """Few while there are many rays, so that little is computed behind opaque surfaces."""
-    return min(max(ROUND_SAMPLES[device.type] // rays, MIN_ROUND_SAMPLES_PER_RAY), MAX_ROUND_SAMPLES_PER_RAY)
+    most = MAX_ROUND_SAMPLES_PER_RAY[device.type]
+    return min(max(ROUND_SAMPLES[device.type] // rays, MIN_ROUND_SAMPLES_PER_RAY), most)

@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import torch
@@ -154,10 +153,8 @@ class HashGridTrainer:
         self.exp_avg = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.exp_avg_sq = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.grad_table = torch.zeros_like(model.table)
-        tables = model.table, self.grad_table, self.exp_avg["table"], self.exp_avg_sq["table"]
-        self.levels = [
-            tuple(tensor[first:end] for tensor in tables) for first, end in pairwise(model.layout.level_offsets)
-        ]
+        if settings.background != "random":
+            self.fixed_background = torch.tensor(settings.background, device=dataset.device)
         self.samples_per_ray = torch.tensor(INITIAL_SAMPLES_PER_RAY, dtype=torch.float64)
         self.pixel_sampler = PixelSampler(self.dataset.unmasked_count, settings.seed, dataset.device)
         self.pixels_sampled = torch.tensor(0)  # so far; steps differ in how many they take
@@ -230,7 +227,7 @@ class HashGridTrainer:
         if self.settings.background == "random":
             background = torch.rand(count, 3, generator=random, device=device)
         else:
-            background = torch.tensor(self.settings.background, device=device).repeat(count, 1)
+            background = self.fixed_background.repeat(count, 1)
         target = colour if alpha is None else torch.lerp(background, colour, alpha[:, None])
         jitter, thinning_offset = torch.rand(2, count, generator=random, device=device)
         return HashGridBatch(rays, target, background, jitter, thinning_offset, view, sparse_depth)
@@ -320,10 +317,12 @@ class HashGridTrainer:
 
     def _update(self, micro_batches: Sequence[_MicroBatch], factor: float, adam_step: int) -> None:
         """Update the table's levels, which share no rows, the networks, the per-image parameters and the occupancy
-        grid, each on a core. ``factor`` scales all learning rates."""
-        finest_first = range(len(self.model.layout.resolutions) - 1, -1, -1)  # no core waits long for the last
+        grid, each on a core; on a GPU all levels at once. ``factor`` scales all learning rates."""
+        levels = range(len(self.model.layout.resolutions))
+        finest_first = [levels[level : level + 1] for level in reversed(levels)]  # no core waits long for the last
+        together = [levels] if self.dataset.device.type == "cuda" else finest_first
         learning_rate = self.settings.learning_rate * factor
-        work = [partial(self._update_level, level, micro_batches, learning_rate, adam_step) for level in finest_first]
+        work = [partial(self._update_levels, some, micro_batches, learning_rate, adam_step) for some in together]
         networks = [each.grad_networks._asdict() for each in micro_batches]
         work.append(partial(self._update_small, Weights._fields, networks, learning_rate, adam_step))
         background = [*(each.grad_background for each in micro_batches), self._background_prior(micro_batches)]
@@ -344,14 +343,17 @@ class HashGridTrainer:
         }
         return {name: BACKGROUND_PRIOR / rays * table * touched[name] for name, table in self.background.items()}
 
-    def _update_level(
-        self, level: int, micro_batches: Sequence[_MicroBatch], learning_rate: float, adam_step: int
+    def _update_levels(
+        self, levels: range, micro_batches: Sequence[_MicroBatch], learning_rate: float, adam_step: int
     ) -> None:
         layout, backend = self.model.layout, self.model.backend
-        with span("scatter", WorkCounts(gathered_rows=CORNERS * sum(len(each.points) for each in micro_batches))):
+        gathered_rows = CORNERS * len(levels) * sum(len(each.points) for each in micro_batches)
+        with span("scatter", WorkCounts(gathered_rows=gathered_rows)):
             for each in micro_batches:
-                backend.encode_backward_table(layout, level, each.points, each.grad_features, self.grad_table)
-        table, grad, exp_avg, exp_avg_sq = self.levels[level]
+                backend.encode_backward_table(layout, levels, each.points, each.grad_features, self.grad_table)
+        tables = self.model.table, self.grad_table, self.exp_avg["table"], self.exp_avg_sq["table"]
+        rows = slice(layout.level_offsets[levels.start], layout.level_offsets[levels.stop])
+        table, grad, exp_avg, exp_avg_sq = (tensor[rows] for tensor in tables)
         with span("optimiser", WorkCounts(streamed_bytes=ADAM_BYTES * table.numel())):
             backend.adam(table, grad, exp_avg, exp_avg_sq, learning_rate, adam_step)
 

@@ -14,6 +14,7 @@ from nerf.kernels.torch.compositing import (
 )
 from nerf.kernels.torch.early_termination import finish_round, pack_rounds
 from nerf.kernels.torch.encoding import encode, encode_backward_points, encode_backward_table
+from nerf.kernels.torch.gather import gather_rows
 from nerf.kernels.torch.hidden_layer import add_ray_relu, add_ray_relu_backward, relu_backward
 from nerf.kernels.torch.marching import march, sample_points, sample_points_backward
 from nerf.kernels.torch.occupancy import cell_corners, occupancy_bits, scatter_max
@@ -36,6 +37,7 @@ __all__ = [
     "encode_backward_points",
     "encode_backward_table",
     "finish_round",
+    "gather_rows",
     "march",
     "occupancy_bits",
     "pack_rounds",

@@ -28,21 +28,22 @@ def encode(
 
 def encode_backward_table(
     layout: GridLayout,
-    level: int,
+    levels: range,
     points: Float[Tensor, "points 3"],
     grad_features: Float[Tensor, "points width"],
     grad_table: Float[Tensor, "rows features"],
 ) -> None:
-    """Add to the rows of one level in ``grad_table``, in place: every vertex gets the gradient of each point that it
-    served, times its share. Levels share no rows: several threads may each do one."""
-    first_column = level * layout.features
-    columns = grad_features[:, first_column : first_column + layout.features].T.contiguous()
+    """Add to the rows of some levels in ``grad_table``, in place: every vertex gets the gradient of each point that it
+    served, times its share. Levels share no rows: several threads may each do some."""
     flat = grad_table.view(-1)
-    cell, inside = _cell(layout.resolutions[level], points)
-    first_entry = _corner_rows(layout, level, cell).flatten().long() * layout.features
-    shares = _corner_shares(inside)
-    for feature, column in enumerate(columns):
-        flat.scatter_add_(0, first_entry + feature, (shares * column).flatten())
+    for level in levels:
+        first_column = level * layout.features
+        columns = grad_features[:, first_column : first_column + layout.features].T.contiguous()
+        cell, inside = _cell(layout.resolutions[level], points)
+        first_entry = _corner_rows(layout, level, cell).flatten().long() * layout.features
+        shares = _corner_shares(inside)
+        for feature, column in enumerate(columns):
+            flat.scatter_add_(0, first_entry + feature, (shares * column).flatten())
 
 
 def encode_backward_points(

@@ -16,6 +16,7 @@ from nerf.kernels.warp.compositing import (
 )
 from nerf.kernels.warp.early_termination import finish_round, pack_rounds
 from nerf.kernels.warp.encoding import encode, encode_backward_points, encode_backward_table
+from nerf.kernels.warp.gather import gather_rows
 from nerf.kernels.warp.hidden_layer import add_ray_relu, add_ray_relu_backward, relu_backward
 from nerf.kernels.warp.launch import compile_kernels, unavailable_reason
 from nerf.kernels.warp.marching import march, sample_points, sample_points_backward
@@ -40,6 +41,7 @@ __all__ = [
     "encode_backward_points",
     "encode_backward_table",
     "finish_round",
+    "gather_rows",
     "march",
     "occupancy_bits",
     "pack_rounds",

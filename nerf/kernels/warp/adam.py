@@ -1,5 +1,7 @@
 """Adam for gradients that are zero almost everywhere (``nerf.kernels.torch.adam``)."""
 
+from typing import Any
+
 import warp as wp
 from jaxtyping import Float
 from torch import Tensor
@@ -12,7 +14,6 @@ wp.set_module_options({"enable_backward": False})
 _ONE_MINUS_BETA1 = wp.constant(1 - BETA1)
 _ONE_MINUS_BETA2 = wp.constant(1 - BETA2)
 _EPSILON_SQUARED = wp.constant(EPSILON**2)
-_LANES = 16
 
 
 def adam(
@@ -29,26 +30,27 @@ def adam(
         (learning_rate / bias_correction1, 1 / bias_correction2),
         (parameter, gradient, exp_avg, exp_avg_sq),
     )
-    whole, rest = divmod(parameter.numel(), _LANES)
+    lanes, kernel = (4, _adam4) if parameter.is_cuda else (16, _adam16)
+    whole, rest = divmod(parameter.numel(), lanes)
     if rest:
         flat = [tensor.view(-1) for tensor in tensors]
         launch(_adam, rest, *scales, *(tensor[-rest:] for tensor in flat))
         tensors = tuple(tensor[:-rest] for tensor in flat)
-    launch(_adam16, whole, *scales, *tensors)
+    launch(kernel, whole, *scales, *tensors)
 
 
 @wp.func
-def _live(gradient: vec16):
+def _live(gradient: Any):
     """1 where the gradient is not exactly zero, also where it is no number, which wp.min takes for missing; else 0.
 
     Twice, as once does not take the smallest numbers up to 1.
     """
-    one = vec16(1.0)
+    one = type(gradient)(1.0)
     return wp.min(wp.min(wp.abs(gradient) * 3.0e38, one) * 3.0e38, one)
 
 
 @wp.func
-def _roots(x: vec16):
+def _root(x: vec16):
     return vec16(
         wp.sqrt(x[0]),
         wp.sqrt(x[1]),
@@ -69,6 +71,34 @@ def _roots(x: vec16):
     )
 
 
+@wp.func
+def _root(x: wp.vec4):  # Warp's functions are chosen by the types of their arguments
+    return wp.vec4(wp.sqrt(x[0]), wp.sqrt(x[1]), wp.sqrt(x[2]), wp.sqrt(x[3]))
+
+
+@wp.func
+def _adam_entry(
+    i: int,
+    learning_rate: float,
+    correction: float,
+    parameter: wp.array[Any],
+    gradient: wp.array[Any],
+    exp_avg: wp.array[Any],
+    exp_avg_sq: wp.array[Any],
+):
+    g = gradient[i]
+    live = _live(g)
+    if wp.max(live) == 0.0:  # of the gradients themselves it would pass over what is not a number
+        return
+    m = exp_avg[i] + _ONE_MINUS_BETA1 * wp.cw_mul(live, g - exp_avg[i])
+    v = exp_avg_sq[i] + _ONE_MINUS_BETA2 * wp.cw_mul(live, wp.cw_mul(g, g) - exp_avg_sq[i])
+    root = _root(wp.max(correction * v, type(v)(_EPSILON_SQUARED)))
+    parameter[i] = parameter[i] - wp.cw_div(wp.cw_mul(live, learning_rate * m), root)
+    exp_avg[i] = m
+    exp_avg_sq[i] = v
+    gradient[i] = type(g)(0.0)
+
+
 @wp.kernel
 def _adam16(
     learning_rate: float,
@@ -78,18 +108,20 @@ def _adam16(
     exp_avg: wp.array[vec16],
     exp_avg_sq: wp.array[vec16],
 ):
-    i = wp.tid()
-    g = gradient[i]
-    live = _live(g)
-    if wp.max(live) == 0.0:  # of the gradients themselves it would pass over what is not a number
-        return
-    m = exp_avg[i] + _ONE_MINUS_BETA1 * wp.cw_mul(live, g - exp_avg[i])
-    v = exp_avg_sq[i] + _ONE_MINUS_BETA2 * wp.cw_mul(live, wp.cw_mul(g, g) - exp_avg_sq[i])
-    root = _roots(wp.max(correction * v, vec16(_EPSILON_SQUARED)))
-    parameter[i] = parameter[i] - wp.cw_div(wp.cw_mul(live, learning_rate * m), root)
-    exp_avg[i] = m
-    exp_avg_sq[i] = v
-    gradient[i] = vec16(0.0)
+    _adam_entry(wp.tid(), learning_rate, correction, parameter, gradient, exp_avg, exp_avg_sq)
+
+
+@wp.kernel
+def _adam4(
+    learning_rate: float,
+    correction: float,
+    parameter: wp.array[wp.vec4],
+    gradient: wp.array[wp.vec4],
+    exp_avg: wp.array[wp.vec4],
+    exp_avg_sq: wp.array[wp.vec4],
+):
+    """For a GPU, whose neighbouring threads should touch neighbouring memory."""
+    _adam_entry(wp.tid(), learning_rate, correction, parameter, gradient, exp_avg, exp_avg_sq)
 
 
 @wp.kernel

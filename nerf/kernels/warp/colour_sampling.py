@@ -21,11 +21,11 @@ def select_colour_samples(
 ) -> ColourSamples:
     """As in nerf.kernels.torch.colour_sampling."""
     rays, device = len(depth), sigma.device
-    counts = torch.empty(rays, dtype=torch.int32, device=device)
+    counts = torch.zeros(rays + 1, dtype=torch.int32, device=device)
     found, found_weights = torch.empty_like(samples.ray), torch.empty_like(sigma)
     packed = samples.starts, samples.dt, sigma
     launch(_find, rays, *packed, 1 / opacity_step, depth, accumulated, counts, found, found_weights)
-    starts = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int32), (1, 0))
+    starts = counts.cumsum(0, dtype=torch.int32)
     total = int(starts[-1])
     index, ray = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
     t, dt, weights = (torch.empty(total, device=device) for _ in range(3))
@@ -56,7 +56,7 @@ def _find(
     ray = wp.tid()
     start = starts[ray]
     end = starts[ray + 1]
-    counts[ray] = 0
+    counts[ray + 1] = 0
     if start == end:
         return
     tau = depth[ray]
@@ -76,7 +76,7 @@ def _find(
         steps = now
     depth[ray] = tau
     accumulated[ray] = previous
-    counts[ray] = place - start
+    counts[ray + 1] = place - start
 
 
 @wp.kernel

@@ -30,11 +30,11 @@ def visible_samples(
 ) -> tuple[Samples, Int32[Tensor, "kept"]]:
     """As in nerf.kernels.torch.compositing."""
     rays, device = len(samples.starts) - 1, sigma.device
-    counts = torch.empty(rays, dtype=torch.int32, device=device)
+    counts = torch.zeros(rays + 1, dtype=torch.int32, device=device)
     launch(
         _count_visible, rays, samples.starts, samples.dt, sigma, threshold, thinning_threshold, thinning_offset, counts
     )
-    starts = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int32), (1, 0))
+    starts = counts.cumsum(0, dtype=torch.int32)
     total = int(starts[-1])
     index, ray = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
     t, dt = (torch.empty(total, device=device) for _ in range(2))
@@ -147,7 +147,7 @@ def _count_visible(
         else:
             count += 1
         i += 1
-    counts[ray] = count
+    counts[ray + 1] = count
 
 
 @wp.kernel

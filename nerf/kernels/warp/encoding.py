@@ -26,22 +26,28 @@ def encode(
     """As in nerf.kernels.torch.encoding."""
     features = points.new_empty(len(points), layout.width)
     levels = _levels(layout, points.device)
-    launch(_encode, len(points), levels, len(layout.resolutions), table, points, features)
+    count = len(layout.resolutions)
+    if points.is_cuda:
+        launch(_encode_lanes, count * len(points), levels, count, table, points, features)
+    else:
+        launch(_encode, len(points), levels, count, table, points, features)
     return features
 
 
 def encode_backward_table(
     layout: GridLayout,
-    level: int,
+    levels: range,
     points: Float[Tensor, "points 3"],
     grad_features: Float[Tensor, "points width"],
     grad_table: Float[Tensor, "rows features"],
 ) -> None:
     """As in nerf.kernels.torch.encoding. Points are added in their order on the CPU, in any order on a GPU."""
-    levels = _levels(layout, points.device)
-    launch(
-        _encode_backward_table, len(points), levels, len(layout.resolutions), level, points, grad_features, grad_table
-    )
+    sizes, tensors = (_levels(layout, points.device), len(layout.resolutions)), (points, grad_features, grad_table)
+    if points.is_cuda:
+        launch(_encode_backward_table_lanes, len(levels) * len(points), *sizes, levels.start, len(points), *tensors)
+        return
+    for level in levels:
+        launch(_encode_backward_table, len(points), *sizes, level, *tensors)
 
 
 def encode_backward_points(
@@ -182,6 +188,25 @@ def _encode(
 
 
 @wp.kernel
+def _encode_lanes(
+    levels: wp.array[wp.vec4i],
+    count: int,
+    table: wp.array[wp.vec4],
+    points: wp.array[wp.vec3],
+    features: wp.array[wp.vec4],
+):
+    """A thread per level of a point: on a GPU neighbouring threads should touch neighbouring memory."""
+    i = wp.tid()
+    level = levels[i % count]
+    scaled = float(level[0]) * points[i / count]
+    x = _cell(scaled[0], level[0])
+    y = _cell(scaled[1], level[0])
+    z = _cell(scaled[2], level[0])
+    shares = _corner_shares(scaled[0] - float(x), scaled[1] - float(y), scaled[2] - float(z))
+    _interpolate(table, _corner_rows(level, x, y, z), shares, features, i)
+
+
+@wp.kernel
 def _encode_backward_table(
     levels: wp.array[wp.vec4i],
     count: int,
@@ -202,6 +227,83 @@ def _encode_backward_table(
     grad = grad_features[i * count + index]
     for corner in range(8):
         wp.atomic_add(grad_table, rows[corner], shares[corner] * grad)
+
+
+# Neighbouring threads of a GPU have neighbouring samples, of which many share the cell of a coarse grid: thousands
+# would wait for each other to add to the same few rows. So a run of threads with one cell first sums what it adds.
+# That all of a row is added at once needs compute capability 9.
+@wp.func_native("""
+    float sums[8][4];
+    for (int corner = 0; corner < 8; ++corner)
+        for (int k = 0; k < 4; ++k)
+            sums[corner][k] = shares.c[corner] * grad.c[k];
+    bool adds = true;
+#ifdef __CUDA_ARCH__
+    const unsigned active = __activemask();
+    const int lane = threadIdx.x & 31;
+    const bool follows = lane > 0 && ((active >> (lane - 1)) & 1u);
+    const int before_level = __shfl_up_sync(active, level, 1);
+    const int before_x = __shfl_up_sync(active, x, 1);
+    const int before_y = __shfl_up_sync(active, y, 1);
+    const int before_z = __shfl_up_sync(active, z, 1);
+    adds = !follows || before_level != level || before_x != x || before_y != y || before_z != z;
+    const unsigned heads = __ballot_sync(active, adds);
+    if (heads != active) {
+        const unsigned later = lane == 31 ? 0u : heads & (~0u << (lane + 1));
+        const unsigned ended = lane == 31 ? 0u : ~active & (~0u << (lane + 1));
+        const int next = later ? __ffs(later) - 1 : 32;
+        const int end = min(next, ended ? __ffs(ended) - 1 : 32);
+        for (int offset = 1; offset < 32; offset <<= 1) {
+            const bool within = lane + offset < end;
+            if (!__any_sync(active, within))
+                break;
+            for (int corner = 0; corner < 8; ++corner)
+                for (int k = 0; k < 4; ++k) {
+                    const float more = __shfl_down_sync(active, sums[corner][k], offset);
+                    sums[corner][k] += within ? more : 0.0f;
+                }
+        }
+    }
+#endif
+    if (adds)
+        for (int corner = 0; corner < 8; ++corner) {
+            auto* row = grad_table.data + rows.c[corner];
+            assert(rows.c[corner] >= 0 && rows.c[corner] < grad_table.shape[0]);
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+            atomicAdd(reinterpret_cast<float4*>(row),
+                make_float4(sums[corner][0], sums[corner][1], sums[corner][2], sums[corner][3]));
+#else
+            for (int k = 0; k < 4; ++k)
+                wp::atomic_add(&row->c[k], sums[corner][k]);
+#endif
+        }
+""")
+def _add_to_rows(
+    grad_table: wp.array[wp.vec4], rows: vec8i, shares: vec8, grad: wp.vec4, level: int, x: int, y: int, z: int
+):
+    """grad_table[rows] += shares times grad, for the corners of cell (x, y, z) of a level."""
+
+
+@wp.kernel
+def _encode_backward_table_lanes(
+    levels: wp.array[wp.vec4i],
+    count: int,
+    first: int,
+    number: int,
+    points: wp.array[wp.vec3],
+    grad_features: wp.array[wp.vec4],
+    grad_table: wp.array[wp.vec4],
+):
+    """For a GPU: of so many levels from the first on, a thread per level of a point."""
+    i = wp.tid() % number
+    index = first + wp.tid() / number
+    level = levels[index]
+    scaled = float(level[0]) * points[i]
+    x = _cell(scaled[0], level[0])
+    y = _cell(scaled[1], level[0])
+    z = _cell(scaled[2], level[0])
+    shares = _corner_shares(scaled[0] - float(x), scaled[1] - float(y), scaled[2] - float(z))
+    _add_to_rows(grad_table, _corner_rows(level, x, y, z), shares, grad_features[i * count + index], index, x, y, z)
 
 
 @wp.kernel

@@ -1,6 +1,8 @@
 """The hidden layer of the colour network, whose input is part the sample's and part its ray's
 (``nerf.kernels.torch.hidden_layer``)."""
 
+from typing import Any
+
 import warp as wp
 from jaxtyping import Float
 from torch import Tensor
@@ -11,6 +13,8 @@ from nerf.kernels.warp.launch import launch, vec16
 wp.set_module_options({"enable_backward": False})
 
 _HIDDEN = 64
+# On a GPU, whose neighbouring threads should touch neighbouring memory, a thread has four numbers of a row.
+LANES = 16
 # Samples whose gradients are summed by themselves before they join their ray's: of n numbers one after the other, in
 # float32, up to n half ulps are lost, here 64 + 64 for a ray of 4096. Sums in float64 take twice the vectors.
 _TOGETHER = wp.constant(64)
@@ -18,7 +22,10 @@ _TOGETHER = wp.constant(64)
 
 def add_ray_relu(samples: Samples, hidden: Float[Tensor, "samples 64"], ray_hidden: Float[Tensor, "rays 64"]) -> None:
     """As in nerf.kernels.torch.hidden_layer."""
-    launch(_add_ray_relu, len(ray_hidden), samples.starts, ray_hidden, hidden)
+    if hidden.is_cuda:
+        launch(_add_ray_relu_lanes, LANES * len(hidden), samples.ray, ray_hidden, hidden)
+    else:
+        launch(_add_ray_relu, len(ray_hidden), samples.starts, ray_hidden, hidden)
 
 
 def add_ray_relu_backward(
@@ -26,25 +33,31 @@ def add_ray_relu_backward(
 ) -> Float[Tensor, "rays 64"]:
     """As in nerf.kernels.torch.hidden_layer."""
     ray_hidden = grad.new_empty(len(samples.starts) - 1, _HIDDEN)
-    launch(_add_ray_relu_backward, len(ray_hidden), samples.starts, hidden, grad, ray_hidden)
+    if hidden.is_cuda:
+        launch(_add_ray_relu_backward_lanes, LANES * len(ray_hidden), samples.starts, hidden, grad, ray_hidden)
+    else:
+        launch(_add_ray_relu_backward, len(ray_hidden), samples.starts, hidden, grad, ray_hidden)
     return ray_hidden
 
 
 def relu_backward(hidden: Float[Tensor, "samples 64"], grad: Float[Tensor, "samples 64"]) -> None:
     """As in nerf.kernels.torch.hidden_layer."""
-    launch(_relu_backward, 4 * len(hidden), hidden, grad)
+    if hidden.is_cuda:
+        launch(_relu_backward_lanes, LANES * len(hidden), hidden, grad)
+    else:
+        launch(_relu_backward, 4 * len(hidden), hidden, grad)
 
 
 @wp.func
-def _rectified(x: vec16):
+def _rectified(x: Any):
     """max(x, 0), and NaN where x is not a number: wp.max alone takes NaN for missing. 0 x changes no finite number."""
-    return wp.max(x, vec16(0.0)) + 0.0 * x
+    return wp.max(x, type(x)(0.0)) + 0.0 * x
 
 
 @wp.func
-def _where_positive(hidden: vec16, grad: vec16):
+def _where_positive(hidden: Any, grad: Any):
     """The gradient where the layer let it through: hidden is zero or, twice multiplied, surely 1 or more."""
-    one = vec16(1.0)
+    one = type(hidden)(1.0)
     return wp.cw_mul(grad, wp.min(wp.min(3.0e38 * hidden, one) * 3.0e38, one))
 
 
@@ -94,5 +107,37 @@ def _add_ray_relu_backward(
 
 @wp.kernel
 def _relu_backward(hidden: wp.array[vec16], grad: wp.array[vec16]):
+    i = wp.tid()
+    grad[i] = _where_positive(hidden[i], grad[i])
+
+
+@wp.kernel
+def _add_ray_relu_lanes(rays: wp.array[int], of_ray: wp.array[wp.vec4], hidden: wp.array[wp.vec4]):
+    i = wp.tid()
+    hidden[i] = _rectified(hidden[i] + of_ray[16 * rays[i >> 4] + (i & 15)])
+
+
+@wp.kernel
+def _add_ray_relu_backward_lanes(
+    starts: wp.array[int], hidden: wp.array[wp.vec4], grad: wp.array[wp.vec4], of_ray: wp.array[wp.vec4]
+):
+    i = wp.tid()
+    ray = i >> 4
+    lane = i & 15
+    end = starts[ray + 1]
+    total = wp.vec4(0.0)
+    for first in range(starts[ray], end, _TOGETHER):
+        some = wp.vec4(0.0)
+        for sample in range(first, wp.min(first + _TOGETHER, end)):
+            place = 16 * sample + lane
+            let_through = _where_positive(hidden[place], grad[place])
+            grad[place] = let_through
+            some += let_through
+        total += some
+    of_ray[i] = total
+
+
+@wp.kernel
+def _relu_backward_lanes(hidden: wp.array[wp.vec4], grad: wp.array[wp.vec4]):
     i = wp.tid()
     grad[i] = _where_positive(hidden[i], grad[i])

@@ -24,7 +24,7 @@ def march(occupied: BinaryOccupancy, stepping: RayStepping, rays: Rays, jitter: 
     """As in nerf.kernels.torch.marching."""
     count, device = len(jitter), jitter.device
     found = _scratch(count * stepping.max_samples, device)
-    counts = torch.empty(count, dtype=torch.int32, device=device)
+    counts = torch.zeros(count + 1, dtype=torch.int32, device=device)
     first = torch.empty(count, device=device)
     far = torch.empty(count, device=device)
     sizes = (
@@ -35,7 +35,7 @@ def march(occupied: BinaryOccupancy, stepping: RayStepping, rays: Rays, jitter: 
         stepping.max_samples,
     )
     launch(_march, count, *occupied, *sizes, *rays, jitter, found, counts, first, far)
-    starts = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int32), (1, 0))
+    starts = counts.cumsum(0, dtype=torch.int32)
     total = int(starts[-1])
     ray = torch.empty(total, dtype=torch.int32, device=device)
     t, dt = torch.empty(total, device=device), torch.empty(total, device=device)
@@ -204,7 +204,7 @@ def _march(
     d = directions[ray]
     near = nears[ray]
     far = fars[ray]
-    counts[ray] = 0
+    counts[ray + 1] = 0
     if near >= far:  # its light is used up
         return
     if contracted == 0:
@@ -237,7 +237,7 @@ def _march(
                 found[ray * most + count] = k
                 count += 1
             k += 1
-    counts[ray] = count
+    counts[ray + 1] = count
     firsts[ray] = first
     ends[ray] = far
 

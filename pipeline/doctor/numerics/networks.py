@@ -90,7 +90,7 @@ def _encode_table(backend: Backend, table: Tensor) -> Tensor:
 def _encode_table_backward(backend: Backend, grad: Tensor, table: Tensor) -> tuple[Tensor]:
     total = torch.zeros_like(table)
     for level in range(len(LAYOUT.resolutions)):
-        backend.encode_backward_table(LAYOUT, level, _table_points(table), grad, total)
+        backend.encode_backward_table(LAYOUT, range(level, level + 1), _table_points(table), grad, total)
     return (total,)
 
 

@@ -103,8 +103,7 @@ def test_all_gradients_are_those_of_autograd(settings: HashGridSettings, monkeyp
     grad = Rendering(torch.tensor([1.0, 2.0, -3.0], dtype=torch.float64).expand(6, 3), ones, 0 * ones)
     gradients = model.backward(done, grad, torch.zeros_like(done.weights))
     grad_table = torch.zeros_like(model.table)
-    for level in range(2):
-        reference.encode_backward_table(model.layout, level, done.points, gradients.features, grad_table)
+    reference.encode_backward_table(model.layout, range(2), done.points, gradients.features, grad_table)
     ray_hidden = model.rays_backward(done, gradients)
 
     of_sky = [model.background_backward(done, gradients)] if settings.background_model else []
@@ -304,7 +303,7 @@ def in_short_rounds(monkeypatch: pytest.MonkeyPatch, whole: int, shortest: int, 
     for name, length in {
         "ROUND_SAMPLES": {"cpu": whole},
         "MIN_ROUND_SAMPLES_PER_RAY": shortest,
-        "MAX_ROUND_SAMPLES_PER_RAY": longest,
+        "MAX_ROUND_SAMPLES_PER_RAY": {"cpu": longest},
     }.items():
         monkeypatch.setattr(f"nerf.rendering.early_termination.{name}", length)
 

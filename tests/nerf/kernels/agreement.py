@@ -22,16 +22,18 @@ FOLDED = RayStepping(0.01, 0.02, True, 32, 1024)
 STEPPINGS = {"bounded": BOUNDED, "folded": FOLDED}
 
 
-def generator(device: str, seed: int) -> torch.Generator:
-    return torch.Generator(device).manual_seed(seed)
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator("cpu").manual_seed(seed)
 
 
 def normal(device: str, seed: int, *shape: int) -> Tensor:
-    return torch.randn(shape, generator=generator(device, seed), device=device)
+    """The same numbers on every device."""
+    return torch.randn(shape, generator=generator(seed), device="cpu").to(device)
 
 
 def uniform(device: str, seed: int, *shape: int) -> Tensor:
-    return torch.rand(shape, generator=generator(device, seed), device=device)
+    """The same numbers on every device."""
+    return torch.rand(shape, generator=generator(seed), device="cpu").to(device)
 
 
 def doubled(value: Any) -> Any:

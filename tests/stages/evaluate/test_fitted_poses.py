@@ -68,7 +68,7 @@ def test_refined_poses_are_written_in_scene_units(tmp_path: Path) -> None:
     inputs, scene = photographed(tmp_path)
     views = scene.of_split("train")
     dataset = training_dataset(inputs["ingest"], scene, "train", 1.0, Quiet())
-    near = dataset._replace(known=dataset.first_pixel[:-1] + 5, distance=torch.full((len(views),), 0.25))
+    near = dataset._replace(sparse_pixels=dataset.first_pixel[:-1] + 5, sparse_depths=torch.full((len(views),), 0.25))
     effects = image_effects(Decisions({"pose_refinement": {}}), views, near)
     effects.rays[0].parameters["offset"][1] = torch.tensor([1.0, 0.0, -2.0])
     learnt = learnt_effects(effects, views)["pose_refinement"]

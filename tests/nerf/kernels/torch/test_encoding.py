@@ -82,7 +82,7 @@ def test_the_table_gradient_is_the_transposed_map_and_is_added() -> None:
     table, points, grad = random_inputs()
     given = torch.full_like(table, 0.5)
     for level in range(len(LAYOUT.resolutions)):
-        encode_backward_table(LAYOUT, level, points, grad, given)
+        encode_backward_table(LAYOUT, range(level, level + 1), points, grad, given)
     wanted = torch.autograd.grad(encode(LAYOUT, table.requires_grad_(), points), table, grad)[0]
     torch.testing.assert_close(given - 0.5, wanted, rtol=0, atol=1e-12)
     assert (wanted == 0).any() and (wanted != 0).any()
@@ -113,7 +113,7 @@ def test_few_points_do(count: int) -> None:
     table, points, grad = random_inputs(count=count)
     given = torch.zeros_like(table)
     for level in range(len(LAYOUT.resolutions)):
-        encode_backward_table(LAYOUT, level, points, grad, given)
+        encode_backward_table(LAYOUT, range(level, level + 1), points, grad, given)
     assert encode(LAYOUT, table, points).shape == (count, 6)
     assert encode_backward_points(LAYOUT, table, points, grad).shape == (count, 3)
     assert given.any().item() == (count > 0)

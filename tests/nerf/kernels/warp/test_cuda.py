@@ -12,12 +12,13 @@ assert nerf.kernels.warp.adam  # the package defines all kernels when it is impo
 
 # With their kernels.
 MODULES = {
-    "adam": 2,
+    "adam": 3,
     "colour_sampling": 3,
     "compositing": 6,
     "early_termination": 2,
-    "encoding": 3,
-    "hidden_layer": 3,
+    "encoding": 5,
+    "gather": 1,
+    "hidden_layer": 6,
     "marching": 4,
     "occupancy": 3,
     "sparse_depth": 2,

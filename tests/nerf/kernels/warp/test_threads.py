@@ -152,7 +152,7 @@ def everything(seed: int) -> list[Tensor]:
     features = warp.encode(layout, table, points)
     grad_table = torch.zeros_like(table)
     for level in range(3):
-        warp.encode_backward_table(layout, level, points, features, grad_table)
+        warp.encode_backward_table(layout, range(level, level + 1), points, features, grad_table)
     grad_points = warp.encode_backward_points(layout, table, points, features)
     grad_rays = warp.sample_points_backward(rays, samples, stepping.contracted, grad_points)
     sigma, colour = features[:, 0].exp(), features[:, 1:4].sigmoid()

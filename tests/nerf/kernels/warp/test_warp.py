@@ -99,8 +99,8 @@ def test_gradients_of_the_encoding(device: str, layout) -> None:
     given, wanted = normal(device, 4, layout.rows, 4), normal(device, 4, layout.rows, 4).double()
     for level, (first, end) in enumerate(pairwise(layout.level_offsets)):
         before = given.clone()
-        warp.encode_backward_table(layout, level, points, grad, given)
-        reference.encode_backward_table(layout, level, points.double(), grad.double(), wanted)
+        warp.encode_backward_table(layout, range(level, level + 1), points, grad, given)
+        reference.encode_backward_table(layout, range(level, level + 1), points.double(), grad.double(), wanted)
         outside = torch.ones(layout.rows, dtype=torch.bool, device=device)
         outside[first:end] = False
         assert torch.equal(given[outside], before[outside]), "levels share no rows"
@@ -277,7 +277,7 @@ def test_no_rays_and_no_samples_are_fine_even_at_first(device: str, rays: int) -
         table = torch.ones(layout.rows, 4, device=device)
         features = agree("encode", layout, table, none)
         agree("encode_backward_points", layout, table, none, features)
-        warp.encode_backward_table(layout, 0, none, features, table)
+        warp.encode_backward_table(layout, range(1), none, features, table)
         agree("visible_samples", samples, empty, 0.5, 0.1, few.near)
         agree("spherical_harmonics", few.directions)
         agree("pack_rounds", [samples, samples])

@@ -1,0 +1,69 @@
+"""Kernels in the form that a GPU runs, a few numbers a thread, agree with those of the CPU on a CPU as well."""
+
+from typing import Any
+
+import torch
+
+from nerf.kernels import grid_layout, warp
+from nerf.kernels.torch.adam import BETA1, BETA2
+from nerf.kernels.warp import encoding, gather, hidden_layer
+from nerf.kernels.warp.adam import _adam4
+from nerf.kernels.warp.launch import launch
+from tests.nerf.kernels.agreement import normal, packed, uniform
+
+LAYOUT = grid_layout(3, 4, 32, 8, 4)
+COUNTS = [3, 0, 70, 1]
+
+
+def run(kernel: Any, count: int, *arguments: Any) -> None:
+    launch(kernel, count, *arguments)
+
+
+def test_encoding() -> None:
+    points, table = uniform("cpu", 1, 99, 3), normal("cpu", 2, LAYOUT.rows, 4)
+    lanes, levels = torch.empty(99, LAYOUT.width), encoding._levels(LAYOUT, points.device)
+    run(encoding._encode_lanes, 3 * 99, levels, 3, table, points, lanes)
+    torch.testing.assert_close(lanes, warp.encode(LAYOUT, table, points))
+
+
+def test_gradients_of_the_table() -> None:
+    points, grad = uniform("cpu", 1, 99, 3), normal("cpu", 2, 99, LAYOUT.width)
+    wanted, found = torch.zeros(LAYOUT.rows, 4), torch.zeros(LAYOUT.rows, 4)
+    warp.encode_backward_table(LAYOUT, range(1, 3), points, grad, wanted)
+    levels = encoding._levels(LAYOUT, points.device)
+    run(encoding._encode_backward_table_lanes, 2 * 99, levels, 3, 1, 99, points, grad, found)
+    torch.testing.assert_close(found, wanted)
+    assert wanted.any() and not wanted[: LAYOUT.level_offsets[1]].any()
+
+
+def test_hidden_layer() -> None:
+    samples, of_ray = packed("cpu", COUNTS), normal("cpu", 3, len(COUNTS), 64)
+    hidden, grad = normal("cpu", 4, len(samples.t), 64), normal("cpu", 5, len(samples.t), 64)
+    hidden[5, 7] = torch.nan
+    by_lanes, its_grad = hidden.clone(), grad.clone()
+    warp.add_ray_relu(samples, hidden, of_ray)
+    run(hidden_layer._add_ray_relu_lanes, 16 * len(hidden), samples.ray, of_ray, by_lanes)
+    torch.testing.assert_close(by_lanes, hidden, rtol=0, atol=0, equal_nan=True)
+    hidden[5, 7] = 1.0
+    wanted, found = warp.add_ray_relu_backward(samples, hidden, grad), torch.empty(len(COUNTS), 64)
+    run(hidden_layer._add_ray_relu_backward_lanes, 16 * len(found), samples.starts, hidden, its_grad, found)
+    torch.testing.assert_close((found, its_grad), (wanted, grad))
+    run(hidden_layer._relu_backward_lanes, 16 * len(hidden), hidden, (again := normal("cpu", 5, len(hidden), 64)))
+    torch.testing.assert_close(again, grad)
+
+
+def test_adam() -> None:
+    gradient = normal("cpu", 6, 40, 4) * (uniform("cpu", 7, 40, 4) > 0.5)
+    gradient[3], gradient[4, 1] = 0.0, torch.nan
+    state = [normal("cpu", 8, 40, 4), gradient, normal("cpu", 9, 40, 4), uniform("cpu", 10, 40, 4)]
+    found = [tensor.clone() for tensor in state]
+    warp.adam(*state, learning_rate=0.1, step=1)
+    run(_adam4, 40, 0.1 / (1 - BETA1), 1 / (1 - BETA2), *found)
+    torch.testing.assert_close(found, state, equal_nan=True)
+
+
+def test_gathering_rows() -> None:
+    values, rows = normal("cpu", 11, 20, 12), torch.tensor([3, 19, 0, 3], dtype=torch.int32)
+    gathered = torch.empty(4, 12)
+    run(gather._gather_rows, 4 * 3, 3, values, rows, gathered)
+    assert torch.equal(gathered, values[rows.long()])
