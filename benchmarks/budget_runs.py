@@ -37,6 +37,7 @@ from stages.train import Config
 from stages.train.data import field_background, guided_dataset, training_dataset
 from stages.train.fields.field_list import field_of, make_trainer, with_defaults
 from stages.train.fields.hash_grid_options import HashGridOptions
+from stages.train.fields.space import chosen_space
 from stages.train.planning import chosen_downscale
 
 BUDGETS = (125, 250, 500, 1000, 2000)
@@ -78,7 +79,7 @@ def bench_of(workspace: Path) -> Bench:
     scene, decisions = read_scene(inputs["normalise"]), read_decisions(inputs["effects"])
     config = with_defaults(
         Config(
-            contracted="background" in decisions.on,
+            space=chosen_space(decisions, scene)[0],
             view_dependence="view_dependence" in decisions.on,
             grid=HashGridOptions(backend=chosen_backend(compute_device(), Quiet()), micro_batches=MICRO_BATCHES),
         )

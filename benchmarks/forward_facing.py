@@ -4,8 +4,8 @@ python -m benchmarks.forward_facing fern.nerf --steps 1500 --out benchmarks/resu
 python -m benchmarks.forward_facing fern.nerf --device cuda --steps 4000 --maps ndc contraction --max-res 1024 2048
 
 A workspace needs its stages up to normalise, and ingest's images. Photos are trained and scored at their full size:
-PSNR over --pixels pixels of each test photo, drawn once. ``cpu_seconds`` is the time of all cores together, without
-scoring.
+PSNR over --pixels pixels of each test photo, drawn once. What is not given is as stage train has it. ``cpu_seconds``
+is the time of all cores together, without scoring.
 """
 
 import argparse
@@ -26,11 +26,23 @@ from nerf.runtime.parallel import take_over_cores, workers
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from nerf.training.metrics import psnr
 from nerf.training.ray_dataset import RayDataset
+from stages.effects.decisions import Space
 from stages.hardware.backend import load_backend
 from stages.io.files import read_json, read_scene
-from stages.train.data import enclosing_pyramid, guided_dataset, training_dataset
-from stages.train.fields.hash_grid import BASE_RES, DEPTH_LOSS, EVEN_UNTIL, MIN_PHOTOS
+from stages.train.data import guided_dataset, training_dataset
+from stages.train.fields.hash_grid import (
+    BASE_RES,
+    DEPTH_LOSS,
+    DISTORTION,
+    EVEN_UNTIL,
+    LEARNING_RATES,
+    MAX_STEPS,
+    MIN_PHOTOS,
+    NDC_STEPS,
+)
+from stages.train.fields.space import enclosing_pyramid
 
+SPACES: dict[str, Space] = {"box": "bounded", "contraction": "contracted", "ndc": "ndc"}
 BLACK = (0.0, 0.0, 0.0)
 STEPS_ACROSS = 1536  # of contracted space, as stage train has them
 RECORDED = (1 / 8, 1 / 4, 1 / 2, 1)  # shares of a run at which it is scored
@@ -53,8 +65,14 @@ def variants(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
     )
     for values in product(*choices):
         run: dict[str, Any] = dict(zip(names, values, strict=True))
-        unused = {"contraction": "diagonal_steps", "box": "distortion"}.get(run["map"])
-        yield run | ({unused: None} if unused else {})
+        space = SPACES[run["map"]]
+        usual = {
+            "distortion": DISTORTION[space],
+            "diagonal_steps": NDC_STEPS if space == "ndc" else MAX_STEPS,
+            "learning_rate": LEARNING_RATES[space],
+        }
+        unused = {"contraction": {"diagonal_steps": None}, "box": {"distortion": None}}.get(run["map"], {})
+        yield {name: usual[name] if value is None else value for name, value in run.items()} | unused
 
 
 def settings_of(run: dict[str, Any], space: SpaceMap, log2_hashmap_size: int) -> HashGridSettings:
@@ -63,10 +81,10 @@ def settings_of(run: dict[str, Any], space: SpaceMap, log2_hashmap_size: int) ->
     return HashGridSettings(
         num_levels=run["num_levels"],
         log2_hashmap_size=log2_hashmap_size,
-        base_res=BASE_RES["contracted" if space.unbounded else "bounded"],
+        base_res=BASE_RES[SPACES[space.kind]],
         max_res=run["max_res"],
         space=space,
-        diagonal_steps=run["diagonal_steps"] or 384,
+        diagonal_steps=run["diagonal_steps"] or MAX_STEPS,
         min_step_size=shortest,
         cone_angle=shortest / EVEN_UNTIL,
         background_model=space.unbounded,
@@ -97,7 +115,7 @@ def train(run: dict[str, Any], model: HashGridField, data: tuple[RayDataset, Ray
             target_samples=given.samples,
             micro_batches=1 if given.device == "cuda" else workers(),
             learning_rate=run["learning_rate"],
-            distortion_weight=run["distortion"] if model.space.unbounded else 0.0,
+            distortion_weight=run["distortion"] or 0.0,
             depth_weight=DEPTH_LOSS,
             min_photos=MIN_PHOTOS,
         ),
@@ -144,9 +162,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--num-levels", type=int, nargs="+", default=[6])
     parser.add_argument("--log2-hashmap-size", type=int, default=18)
     parser.add_argument("--max-res", type=int, nargs="+", default=[1024])
-    parser.add_argument("--distortion", type=float, nargs="+", default=[2e-3])
-    parser.add_argument("--diagonal-steps", type=int, nargs="+", default=[384], help="of box and ndc")
-    parser.add_argument("--learning-rate", type=float, nargs="+", default=[1e-2])
+    parser.add_argument("--distortion", type=float, nargs="+", default=[None])
+    parser.add_argument("--diagonal-steps", type=int, nargs="+", default=[None], help="of box and ndc")
+    parser.add_argument("--learning-rate", type=float, nargs="+", default=[None])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--pixels", type=int, default=20_000, help="of each test photo that are scored")
     add_out(parser)

@@ -108,7 +108,7 @@ def train(ingest: Path, scene: Scene, downscale: float) -> dict[str, Any]:
     """The time of a step of training on a store that has been made, and the memory of the process that took it."""
     device = compute_device()
     grid = HashGridOptions(backend=chosen_backend(device, Spoken()))
-    config = with_defaults(Config(grid=grid, contracted=True, view_dependence=True, downscale=downscale))
+    config = with_defaults(Config(grid=grid, space="contracted", view_dependence=True, downscale=downscale))
     config = field_of(config).with_sizes(config, scene, rays=math.inf)
     dataset = training_dataset(ingest, scene, "train", downscale, Spoken()).to(device)
     trainer, step = make_trainer(config, scene, dataset, config.seed), itertools.count()

@@ -10,6 +10,7 @@ from nerf.runtime.machine_rates import Rates, copied_bytes, measure_copy, measur
 from nerf.runtime.profiler import WorkCounts
 from nerf.training.hash_grid_trainer import ADAM_BYTES
 from stages.amounts import bytes_in_words, short_count
+from stages.effects.decisions import Space
 from stages.hardware.device import compute_device, cores
 from stages.train.config import Config
 from stages.train.fields.hash_grid import SAMPLES_PER_RAY, field_settings, rays_per_step, timed, with_defaults
@@ -19,7 +20,7 @@ TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all of 
 # Of a ray while the hash-grid field trains: densities asked for, beside the colours of
 # stages/train/fields/hash_grid.py. Over a run lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour
 # (docs/experiments/ray_samples.md).
-DENSITIES = {"bounded": 7, "contracted": 24}
+DENSITIES: dict[Space, int] = {"bounded": 7, "contracted": 24}
 WHERE = {"bounded": "around an object", "contracted": "in unbounded space"}
 VANILLA_RAYS = {"vanilla NeRF as published": (8, 256, 64, 128), "vanilla NeRF 4 × 64": (4, 64, 32, 32)}
 
@@ -52,7 +53,7 @@ def _meaning(products: dict[int, float], reads: float, copied: float, count: int
     """What training can reach here at most: the work of a ray that nothing can save, at these rates."""
     lines = ["at these rates, with nothing else to do and no core waiting, training would reach"]
     for space, densities in DENSITIES.items():
-        work = grid_work(space == "contracted", densities)
+        work = grid_work(space, densities)
         most = count / Rates(products[64], reads, copied).seconds(work)
         text = f"hash-grid field {WHERE[space]} ({SAMPLES_PER_RAY[space]} colours, {densities} densities a ray)"
         lines.append(f"  {short_count(most):>8} rays/s  {text}")
@@ -62,14 +63,14 @@ def _meaning(products: dict[int, float], reads: float, copied: float, count: int
     return lines
 
 
-def grid_work(contracted: bool, densities: float) -> WorkCounts:
+def grid_work(space: Space, densities: float) -> WorkCounts:
     """Of a ray in training, its share of the optimiser's included: a large field, in the steps that stage train takes
     on this machine."""
-    asked = Config(contracted=contracted, view_dependence=True)
+    asked = Config(space=space, view_dependence=True)
     config = timed(with_defaults(asked), compute_device())
     model = HashGridField(field_settings(config, sky=False), 0, reference)
     density, colour = mlp.density_flops(model.weights), mlp.colour_flops(model.weights)
-    colours = SAMPLES_PER_RAY[config.space]
+    colours = SAMPLES_PER_RAY[space]
     rows = CORNERS * model.settings.num_levels * (densities + colours)
     adam = ADAM_BYTES * model.table.numel() / rays_per_step(config)
     return WorkCounts(densities * density + colours * (colour + 2 * (density + colour)), rows, adam)

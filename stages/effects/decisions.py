@@ -6,7 +6,7 @@ from typing import Literal
 
 from stages.io.files import read_dataclass, write_json
 
-Space = Literal["bounded", "contracted"]
+Space = Literal["bounded", "contracted", "ndc"]
 
 
 @dataclass(frozen=True)
@@ -15,11 +15,6 @@ class Decisions:
     photo (as exposure has natural logarithms of gains in linear light), or nothing."""
 
     on: dict[str, dict[str, list[float]]] = field(default_factory=dict)
-
-    @property
-    def space(self) -> Space:
-        """What the field lies in: the box, or all of space, contracted."""
-        return "contracted" if "background" in self.on else "bounded"
 
     def having(self, name: str, measured: dict[str, list[float]] | None = None) -> "Decisions":
         """These, with one effect more."""

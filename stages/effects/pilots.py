@@ -29,6 +29,7 @@ from stages.train.config import BLACK, Config
 from stages.train.data import ALL_MASKED, PhotoReader, guided_dataset, view_mask, view_rays
 from stages.train.fields.field_list import make_trainer, with_defaults
 from stages.train.fields.hash_grid_options import HashGridOptions
+from stages.train.fields.space import chosen_space
 from stages.train.planning import seconds_per_step
 from stages.train.validation_images import split_off_validation
 
@@ -128,9 +129,9 @@ def expected_seconds(scene: Scene, steps: int) -> tuple[float, float]:
     """What a pilot takes here: its trainings, by a few steps of a fresh field, and what goes on beside them; and what a
     pilot takes that fits poses, too."""
     arm, device = Decisions({"view_dependence": {}} | ({} if scene.has_alpha else {"background": {}})), compute_device()
-    per_step = seconds_per_step(_config(arm, steps, device), scene, arm, device)
+    per_step = seconds_per_step(_config(arm, scene, steps, device), scene, arm, device)
     trainings = (1 + BESIDE_TRAINING) * 2 * SEEDS * steps * per_step
-    on_cpu = per_step if device == "cpu" else seconds_per_step(_config(arm, steps, "cpu"), scene, arm, "cpu")
+    on_cpu = per_step if device == "cpu" else seconds_per_step(_config(arm, scene, steps, "cpu"), scene, arm, "cpu")
     return trainings, trainings + 2 * SEEDS * MAX_KEPT * STEPS_PER_FIT * on_cpu * min(MICRO_BATCHES, cores())
 
 
@@ -166,19 +167,20 @@ def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> _Train
     """A hash-grid field after ``steps`` steps under the decisions of one arm."""
     views = trial.scene.of_split("train")
     effects = image_effects(arm, views, trial.dataset)
-    trainer = make_trainer(_config(arm, steps, trial.dataset.device.type), trial.scene, trial.dataset, seed, effects)
+    config = _config(arm, trial.scene, steps, trial.dataset.device.type)
+    trainer = make_trainer(config, trial.scene, trial.dataset, seed, effects)
     for step in range(steps):
         trainer.step(step, step / steps, 1.0)
     assert isinstance(trainer.model, HashGridField)
     return _Trained(trainer.model.to("cpu"), {"effects": learnt_effects(trainer.effects, views)})
 
 
-def _config(arm: Decisions, steps: int, device: str) -> Config:
+def _config(arm: Decisions, scene: Scene, steps: int, device: str) -> Config:
     """A small hash-grid field with what stage train would choose."""
     return with_defaults(
         Config(
             steps=steps,
-            contracted="background" in arm.on,
+            space=chosen_space(arm, scene)[0],
             view_dependence="view_dependence" in arm.on,
             grid=HashGridOptions(
                 backend=chosen_backend(device),

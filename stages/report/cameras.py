@@ -70,7 +70,8 @@ def _doubts_of_check(registration: Mapping[str, Any]) -> list[str]:
     photos, check = registration["photos"], registration.get("check")
     doubtful, found = doubtful_files(registration), []
     if len(doubtful) > MAX_DOUBTFUL * photos:
-        excluded = "" if registration["source"] == "import" else ", which were excluded"
+        kept = any(image["registered"] and image["file"] in doubtful for image in registration["images"])
+        excluded = "" if kept else ", which were excluded"
         found.append(f"verified matches contradict the poses of {len(doubtful)} of {photos} photos{excluded}")
     if check is None:
         return found

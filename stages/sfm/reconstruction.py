@@ -107,6 +107,7 @@ def _reconstruct(
             "sfm.repeated-structure", repeated_structure(conflict, {photo.image_name: photo.name for photo in photos})
         )
     _note_unregistered(photos, images, progress)
+    _note_weak_links(photos, found["check"]["weak_links"], progress)
     registration = _registration(
         "sfm",
         repeated_structure=conflict,
@@ -257,6 +258,13 @@ def _note_unregistered(photos: Sequence[Photo], images: list[dict[str, Any]], pr
         by_reason.setdefault(reason, []).append(name)
     for reason, who in by_reason.items():
         progress.note("sfm.unregistered-reason", f"  {listed(who, MAX_NAMES)}: {reason}")
+
+
+def _note_weak_links(photos: Sequence[Photo], links: Sequence[dict[str, Any]], progress: Progress) -> None:
+    """Name the photos whose poses rest on few matches: nothing else would show it if these were wrong."""
+    weak = {file for link in links for file in link["photos"]}
+    if who := [photo.name for photo in photos if photo.image_name in weak]:
+        progress.note("sfm.few-matches", f"few matches hold the poses of {listed(who, MAX_NAMES)} beside the others")
 
 
 def _skipped_for_time(strategies: Sequence[dict[str, Any]]) -> str:

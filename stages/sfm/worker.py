@@ -80,7 +80,7 @@ def reconstruct(job: Job, send: Send) -> dict[str, Any]:
         send(note=note)
     model = finished.model
     checked, left_out = _last_check(model, database, state)
-    checked["doubtful"] = sorted({*checked["doubtful"], *best.excluded, *left_out} - {*_files(model)})
+    checked["doubtful"] = sorted({*checked["doubtful"], *({*best.excluded, *left_out} - {*_files(model)})})
     if state.thinned:  # points that mapping did not have are black until then
         model.extract_colors_for_all_images(state.images)
     left_out = best.excluded | finished.left_out | left_out

@@ -1,7 +1,7 @@
 """Stage tradeoff: a study of what quality costs on this scene and this machine.
 
 It trains fields of several kinds and sizes for several times, at several photo sizes, with several seeds, and scores
-each on the same pixels of the held-out photos, together with the field that the workspace has already. It draws the
+each on the same pixels of the test photos, together with the field that the workspace has already. It draws the
 Pareto front of training time and quality and recommends one point of it. It runs only when it is asked for.
 """
 
@@ -16,7 +16,7 @@ from stages.effects.decisions import Space
 
 INPUTS = ("ingest", "normalise", "effects")
 OPTIONAL_INPUTS = ("train",)
-VERSION = 14
+VERSION = 15
 EXIT_CODE = 19
 RESUMES = True
 ON_REQUEST = True
@@ -29,7 +29,9 @@ class Config(StageConfig):
     seconds: float = Field(default=1800.0, gt=0, description="time for all runs and scores; --budget 30m says the same")
     seeds: int = Field(default=3, ge=1, le=9, description="most runs of one setting; fewer where the time is short")
     downscale: float | None = Field(
-        default=None, ge=1, description="photo width / width of the scores (default: the finest of the study)"
+        default=None,
+        ge=1,
+        description="photo width / width of the scores (default: 1, more where the longer side has over 1600 pixels)",
     )
     # Measured or chosen by plan(); no flag is offered for them.
     speeds: Annotated[dict[str, tuple[float, float]] | None, Suppress] = Field(
@@ -37,9 +39,10 @@ class Config(StageConfig):
     )
     space: Annotated[Space | None, Suppress] = Field(default=None, description="that the scene lies in")
     sizes: Annotated[tuple[float, ...] | None, Suppress] = Field(default=None, description="photo sizes trained at")
-    crops: Annotated[int | None, Suppress] = Field(default=None, description="evaluation crops of the held-out photos")
+    tiles: Annotated[int | None, Suppress] = Field(default=None, description="tiles of the test photos to score")
     reading: Annotated[tuple[float, float], Suppress] = Field(
-        default=(0.0, 0.0), description="seconds to read the photos at one size, and those of the crops"
+        default=(0.0, 0.0),
+        description="seconds to read the photos at one size, and the test photos at the size of the scores",
     )
 
 
@@ -49,7 +52,7 @@ def expected_seconds(config: Config, workload: Workload) -> float:
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
-    """Measure how fast this machine trains each kind of field and reads photos; choose photo sizes and crops."""
+    """Measure how fast this machine trains each kind of field and reads photos; choose photo sizes and tiles."""
     from stages.tradeoff.study import plan_study
 
     return plan_study(config, inputs, progress)

@@ -112,7 +112,7 @@ def _set_axes(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
     axes.set_xlim(min(times) / (max(times) / min(times) * 2) ** NAMES_WIDTH, last)
     axes.set_ylim(min(scores) - room, max(scores) + 2 * room)
     axes.set_xlabel("training time on this machine")
-    axes.set_ylabel("PSNR on held-out photos (dB)")
+    axes.set_ylabel("PSNR on test photos (dB)")
     axes.grid(color=INK, alpha=0.12, lw=0.8)
 
 

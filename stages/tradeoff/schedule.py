@@ -24,6 +24,7 @@ from stages.train.config import FieldName
 from stages.train.data import scaled_size
 from stages.train.fields import hash_grid
 from stages.train.fields.field_list import field_of
+from stages.train.fields.space import chosen_space
 from stages.train.planning import chosen_downscale, rays_per_second
 
 LONGEST_RUN = 1 / 20
@@ -34,7 +35,7 @@ SMALL_SIDE = 128  # pixels: of photos for the vanilla NeRF, which learn nothing 
 WALL_TIME_RATIO = 1.2  # wall time of a run over its training seconds: validation, files, photos read before
 VALIDATION_RAYS = 6144  # rendered at the end of a training, which takes long only where a field renders slowly
 MAX_SCORING = 0.03  # of the study's time, for one score: where it would take more, only every SCORING_STRIDE-th pixel
-SCORING_STRIDE = 4  # is rendered, along both axes of the crops
+SCORING_STRIDE = 4  # is rendered, along both axes of the tiles
 MAX_RUN = 1 / 6  # of the study's time, for one run
 RENDERING_SPEED: dict[FieldName, float] = {"grid": 0.7, "vanilla": 3.0}
 """Rays rendered a second over rays trained, about: rendering does less, but a grid field of few steps is all fog."""
@@ -132,10 +133,10 @@ class Speed(NamedTuple):
 
 
 class ReadingTime(NamedTuple):
-    """Seconds to read photos: all of them before the first run at a size, and those of the evaluation crops."""
+    """Seconds to read photos: all of them before the first run at a size, and the test photos to score."""
 
     photos: float = 0.0
-    crops: float = 0.0
+    scored: float = 0.0
 
 
 NO_READING = ReadingTime()
@@ -143,7 +144,7 @@ NO_READING = ReadingTime()
 
 class Run(NamedTuple):
     """One training of a study, in a scene of that ``space``. ``seconds`` is what it is expected to take in all; every
-    ``stride``-th pixel of the evaluation crops is scored, along both axes."""
+    ``stride``-th pixel of the tiles is scored, along both axes."""
 
     variant: str
     space: Space
@@ -271,7 +272,7 @@ def make_schedule(
     ``scored_rays`` are rendered to score each, and the first run at a photo size has to read the photos. The published
     networks take fewer rays a step only where there is no time for as many as published.
     """
-    left, runs, left_out = seconds * (1 - OTHER_TIME) - reading.crops, dict[str, Run](), dict[str, Run]()
+    left, runs, left_out = seconds * (1 - OTHER_TIME) - reading.scored, dict[str, Run](), dict[str, Run]()
     for variant, size, level, seed in run_order(seeds):
         downscale = downscales[-1 if size == SMALL else min(size, max(0, len(downscales) - 2))]
         run = _run(variant, space, downscale, level, seed, seconds, speeds, scored_rays)
@@ -312,7 +313,7 @@ def rendered_rays_per_second(variant: str, speed: Speed) -> float:
 
 
 def scoring_stride(rendering: float, seconds: float) -> int:
-    """1 to score all pixels of the crops; SCORING_STRIDE where ``rendering`` them takes too many of a study's
+    """1 to score all pixels of the tiles; SCORING_STRIDE where ``rendering`` them takes too many of a study's
     ``seconds``."""
     return 1 if rendering <= MAX_SCORING * seconds else SCORING_STRIDE
 
@@ -357,12 +358,13 @@ def measure_speeds(scene: Scene, inputs: Inputs, seconds: float, progress: Progr
     longer than the whole timing. Otherwise their speed follows from their arithmetic relative to the reduced networks.
     """
     decisions, speeds = read_decisions(inputs["effects"]), dict[str, Speed]()
+    space, _ = chosen_space(decisions, scene)
     for number, name in enumerate(TIMED):
         progress.update(f"timing the training of: {name}", number / len(TIMED))
-        config = _planned(name, decisions.space, inputs, progress)
+        config = _planned(name, space, inputs, progress)
         rays_per_step = field_of(config).rays_per_step(config)
         if VARIANTS[name].family == "published":
-            reduced = _planned(REDUCED, decisions.space, inputs, progress)
+            reduced = _planned(REDUCED, space, inputs, progress)
             rays = speeds[REDUCED].rays * _multiplications(reduced) / _multiplications(config)
             if LONGEST_RUN * seconds * rays < VARIANTS[name].min_steps * rays_per_step:
                 speeds[name] = Speed(rays / rays_per_step, rays)
@@ -385,8 +387,8 @@ def _multiplications(config: train.Config) -> float:
     return (2 * sizes.samples_coarse + sizes.samples_fine) * sizes.depth * sizes.width**2
 
 
-def measure_reading(scene: Scene, ingest: Path, crops: int) -> ReadingTime:
-    """What reading the photos takes, from the time of one of them: all on all cores, those of the crops one by one."""
+def measure_reading(scene: Scene, ingest: Path) -> ReadingTime:
+    """What reading the photos takes, from the time of one of them: all on all cores, the test photos one by one."""
 
     def pixels(views: Sequence[View]) -> int:
         return sum(scene.cameras[view.camera].width * scene.cameras[view.camera].height for view in views)
@@ -396,8 +398,7 @@ def measure_reading(scene: Scene, ingest: Path, crops: int) -> ReadingTime:
         started = time.perf_counter()
         load_pixels(ingest / view.file, *scaled_size(scene.cameras[view.camera], 2.0))
     per_pixel = (time.perf_counter() - started) / pixels(test[:1])
-    scored = [test[number % len(test)] for number in range(crops)]
-    return ReadingTime(per_pixel * pixels(scene.views) / processors(), per_pixel * pixels(scored))
+    return ReadingTime(per_pixel * pixels(scene.views) / processors(), per_pixel * pixels(test))
 
 
 def study_sizes(scene: Scene, speeds: Mapping[str, Speed], seconds: float) -> tuple[float, ...]:

@@ -10,11 +10,11 @@ from nerf.geometry.scene import Scene
 from stages.amounts import duration, resolution_name
 from stages.contract import Inputs, Progress, StageError, StageResult
 from stages.effects.decisions import read_decisions
+from stages.evaluate.tiles import MIN_TILES, TILE_SIZE
 from stages.io.files import read_scene, write_json
 from stages.io.stopwatch import counting
 from stages.tradeoff import plots
 from stages.tradeoff.benchmark import (
-    CROP_SIZE,
     NUM_SHOWN,
     Benchmark,
     WorkspaceField,
@@ -47,12 +47,13 @@ from stages.tradeoff.schedule import (
     study_sizes,
     train_command,
 )
+from stages.train.fields.space import chosen_space
 
 if TYPE_CHECKING:
     from stages.tradeoff import Config
 
-MIN_CROPS, MAX_CROPS = 6, 32
-SCORING_TIME = 0.003  # of the study's time: for rendering all crops once, whatever the field but the published one
+MAX_TILES = 512  # or as few of each test photo as make a score
+SCORING_TIME = 0.003  # of the study's time: for rendering all tiles once, whatever the field but the published one
 MAX_LATE = 0.1  # of the study's time by which it may end late before runs are left out
 
 
@@ -76,22 +77,20 @@ class Outcome(NamedTuple):
 
 
 def plan_study(config: "Config", inputs: Inputs, progress: Progress) -> "Config":
-    """Measure how fast this machine trains each kind of field and reads photos; choose photo sizes and crops."""
+    """Measure how fast this machine trains each kind of field and reads photos; choose photo sizes and tiles."""
     scene = _scene_with_test_photos(inputs)
     speeds = measure_speeds(scene, inputs, config.seconds, progress)
     sizes = config.sizes or study_sizes(scene, speeds, config.seconds)
     quick = [name for name in speeds if VARIANTS[name].family != "published"]
     rendering = min(rendered_rays_per_second(name, speeds[name]) for name in quick)
-    affordable = SCORING_TIME * config.seconds * rendering / CROP_SIZE**2
-    crops = min(max(MIN_CROPS, int(affordable)), MAX_CROPS)
-    reading = measure_reading(scene, inputs["ingest"], crops)
+    affordable = int(SCORING_TIME * config.seconds * rendering / TILE_SIZE**2)
+    reading = measure_reading(scene, inputs["ingest"])
     chosen = {
         "speeds": {name: (round(speed.steps, 4), round(speed.rays, 2)) for name, speed in speeds.items()},
-        "space": read_decisions(inputs["effects"]).space,
+        "space": chosen_space(read_decisions(inputs["effects"]), scene)[0],
         "sizes": sizes,
-        "crops": crops,
-        "reading": (round(reading.photos, 5), round(reading.crops, 5)),
-        "downscale": config.downscale or sizes[0],
+        "tiles": max(min(affordable, MAX_TILES), MIN_TILES * len(scene.of_split("test"))),
+        "reading": (round(reading.photos, 5), round(reading.scored, 5)),
     }
     return config.model_copy(update=chosen)
 
@@ -107,9 +106,9 @@ def _scene_with_test_photos(inputs: Inputs) -> Scene:
 
 def schedule_of(config: "Config") -> Schedule:
     """The runs of a planned study."""
-    assert config.speeds and config.space and config.sizes and config.crops, "plan() chooses them"
+    assert config.speeds and config.space and config.sizes and config.tiles, "plan() chooses them"
     speeds = {name: Speed(*speed) for name, speed in config.speeds.items()}
-    rays = config.crops * CROP_SIZE**2 + NUM_SHOWN * SMALL_SIDE**2
+    rays = config.tiles * TILE_SIZE**2 + NUM_SHOWN * SMALL_SIDE**2
     return make_schedule(
         config.seconds, config.seeds, config.space, config.sizes, speeds, rays, ReadingTime(*config.reading)
     )
@@ -143,18 +142,18 @@ def schedule_lines(schedule: Schedule, seconds: float, runs: Path) -> list[str]:
 
 
 def run_study(config: "Config", inputs: Inputs, folder: Path, progress: Progress) -> Outcome:
-    """Make and score the runs of a planned study, and score the workspace's field on the same crops.
+    """Make and score the runs of a planned study, and score the workspace's field on the same tiles.
 
     Raises:
-        StageError: without held-out photos, where not one run could be scored, or where one could not be trained for
+        StageError: without test photos, where not one run could be scored, or where one could not be trained for
             want of memory or disk.
     """
-    assert config.crops and config.downscale and config.sizes, "plan() chooses them"
+    assert config.tiles and config.sizes, "plan() chooses them"
     scene, schedule, runs = _scene_with_test_photos(inputs), schedule_of(config), folder / "runs"
     for line in schedule_lines(schedule, config.seconds, runs):
         progress.note("tradeoff.schedule", line)
     with counting(folder / "clock.json") as spent:
-        benchmark = make_benchmark(inputs["ingest"], scene, config.downscale, config.crops, config.sizes[-1])
+        benchmark = make_benchmark(inputs["ingest"], scene, config.downscale, config.tiles, config.sizes[-1])
         results, late = list[Result](), list[Run]()
         slowness = 1.0
         for number, run in enumerate(schedule.runs, 1):
@@ -211,7 +210,7 @@ class _RunProgress:
 def save_study(config: "Config", outcome: Outcome, folder: Path, workspace: str) -> StageResult:
     """Write everything. What depends on the clock are records, and so is what the workspace's field says; the scores of
     the runs are outputs. ``workspace``: the name of its folder, for the command to give."""
-    assert config.space and config.downscale, "plan() chooses them"
+    assert config.space, "plan() chooses them"
     results, existing = outcome.results, outcome.existing
     points = points_of(results, workspace_point(existing.facts, existing.figures) if existing else None)
     recommendation = recommend(points)
@@ -222,11 +221,11 @@ def save_study(config: "Config", outcome: Outcome, folder: Path, workspace: str)
         "command": train_command(chosen.variant, chosen.train_seconds, chosen.downscale, config.space, workspace),
         "recommended": points.index(chosen) + 1,
         "still_rising": recommendation.still_rising,
-        "scored": _scored_on(config.downscale, outcome),
+        "scored": _scored_on(outcome),
         "points": table(points),
         "descriptions": describe({point.variant for point in points}, config.space),
         "workspace_field": existing and {"train": existing.key, "stride": existing.stride},
-        "ablation": ablation_sentence(results, config.downscale),
+        "ablation": ablation_sentence(results, outcome.benchmark.size),
         "runs": [{**run._asdict(), **figures} for run, figures in results],
         "left_out": list(outcome.left_out),
     }
@@ -250,16 +249,16 @@ def _quality(result: Result) -> dict[str, Any]:
     return {**result.run.options, "variant": result.run.variant, **figures}
 
 
-def _scored_on(downscale: float, outcome: Outcome) -> str:
+def _scored_on(outcome: Outcome) -> str:
     """What scores are of, and which fields are scored on fewer pixels."""
     slow = [run.variant for run, _ in outcome.results if run.stride > 1]
     slow += [WORKSPACE_FIELD] if outcome.existing and outcome.existing.stride > 1 else []
-    crops = outcome.benchmark.crops
-    photos = len({crop.photo for crop in crops})
+    crops, (width, height) = outcome.benchmark.crops, outcome.benchmark.size
+    tiles = sum(len(crop.truth) // (crop.tile_rows or 1) for crop in crops)
     fewer = f"; {', '.join(dict.fromkeys(slow))}: one in {SCORING_STRIDE} of their rows and columns, to save time"
     return (
-        f"{len(crops)} crops of {CROP_SIZE} × {CROP_SIZE} pixels of {photos} held-out photo{'s' * (photos > 1)} "
-        f"at {resolution_name(downscale)}, the same for all{fewer if slow else ''}"
+        f"{tiles} tiles of {TILE_SIZE} × {TILE_SIZE} pixels of {len(crops)} test photo{'s' * (len(crops) > 1)} "
+        f"at {width} × {height}, the same for all{fewer if slow else ''}"
     )
 
 
@@ -299,8 +298,8 @@ def ablation_differences(results: Sequence[tuple[Run, Mapping[str, Any]]]) -> li
     return found
 
 
-def ablation_sentence(results: Sequence[tuple[Run, Mapping[str, Any]]], scored_at: float) -> str | None:
-    """The differences, of scores at 1/``scored_at`` of the resolution; None where there are none."""
+def ablation_sentence(results: Sequence[tuple[Run, Mapping[str, Any]]], scored_size: tuple[int, int]) -> str | None:
+    """The differences, of scores at this width and height; None where there are none."""
     found = ablation_differences(results)
     if not found:
         return None
@@ -308,12 +307,12 @@ def ablation_sentence(results: Sequence[tuple[Run, Mapping[str, Any]]], scored_a
     seeds = max(part.seeds for part in found)
     pairs = f"seed by seed, of {seeds} seeds (± their standard deviation)" if seeds > 1 else "of one seed"
     differences = "; ".join(f"{part.variant} {part.words}" for part in found)
-    sizes = f"trained on photos at {resolution_name(run.downscale)}, scored at {resolution_name(scored_at)}"
+    sizes = f"trained on photos at {resolution_name(run.downscale)}, scored at {scored_size[0]} × {scored_size[1]}"
     return f"Against the complete reduced method, {pairs}: {differences}; {run.steps:,} steps each, {sizes}."
 
 
 def _ablation_sheet(outcome: Outcome, sentence: str | None, folder: Path) -> tuple[str, ...]:
-    """ablation.png: held-out photos beside what the method, each variant of it and the study's best field make of them,
+    """ablation.png: test photos beside what the method, each variant of it and the study's best field make of them,
     and the ``sentence`` below; the names of the files written, none where no ablation was run."""
     done = [(run, figures) for run, figures in outcome.results if figures["failed"] is None and run.stride == 1]
     ablated = next((run for run, _ in done if run.variant in ABLATIONS), None)

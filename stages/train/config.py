@@ -58,6 +58,11 @@ class Config(StageConfig):
     background: Literal["white", "black", "random"] | None = Field(
         default=None, description="behind photos with transparency (default: random for grid, white for vanilla)"
     )
+    space: Space | None = Field(
+        default=None,
+        description="bounded: the region of interest alone; contracted: all of space; ndc: all that cameras which face "
+        "one way can see (default: by the background and how the cameras stand)",
+    )
     matmul: Literal["highest", "medium"] | None = Field(
         default=None,
         description="torch's precision of matrix products (default: highest; of a run in seconds medium where that is "
@@ -67,8 +72,7 @@ class Config(StageConfig):
     after: Annotated[str | None, Suppress] = Field(default=None, description="go on from this finished training,")
     more_steps: Annotated[int | None, Suppress] = Field(default=None, ge=1, description="for so many steps,")
     more_seconds: Annotated[float | None, Suppress] = Field(default=None, gt=0, description="or for so long")
-    # Stage effects decides these; no flag is offered for them.
-    contracted: Annotated[bool | None, Suppress] = Field(default=None, description="fold in unbounded space")
+    # Stage effects decides it; no flag is offered.
     view_dependence: Annotated[bool | None, Suppress] = Field(default=None, description="colour knows the direction")
 
     grid: HashGridOptions = HashGridOptions()
@@ -117,11 +121,6 @@ class Config(StageConfig):
         """The field that these options ask for."""
         asked: tuple[FieldName, ...] = (*self._flags_by_field(), DEFAULT_FIELD)
         return asked[0]
-
-    @property
-    def space(self) -> Space:
-        """Which of the measured constants count."""
-        return "contracted" if self.contracted else "bounded"
 
     @property
     def time_is_open(self) -> bool:

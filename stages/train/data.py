@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from nerf.geometry.rays import Rays, rays_of_view
-from nerf.geometry.space_maps import Box, Contraction, Ndc, SpaceMap, enclosing_ndc
 from nerf.training.ray_dataset import PosedViews, RayDataset, make_ray_dataset
 from nerf.training.trainer import composite_over
 from stages.contract import Inputs, Progress, StageError
@@ -19,7 +18,7 @@ from stages.effects.track_colours import training_tracks
 from stages.io.files import read_tensors
 from stages.io.pixel_store import PixelStore, StoredPhoto, fill, pixel_store
 from stages.io.pixels import load_mask, load_pixels, loaders
-from stages.sfm.colmap.cameras import border_rays, camera_rays
+from stages.sfm.colmap.cameras import camera_rays
 from stages.train.config import BLACK, WHITE, Config
 
 if TYPE_CHECKING:
@@ -200,20 +199,6 @@ def field_background(config: Config, scene: "Scene") -> tuple[float, float, floa
     return WHITE if scene.has_alpha and config.background != "black" else BLACK
 
 
-def enclosing_pyramid(scene: "Scene") -> Ndc | None:
-    """The space of cameras that face one way, all photos of the scene counted: what test photos show is in it, too.
-    None where they do not face one way."""
-    of_cameras = [border_rays(camera) for camera in scene.cameras]
-    poses = np.stack([view.scene_from_camera for view in scene.views])
-    borders = [of_cameras[view.camera] for view in scene.views]
-    return enclosing_ndc(poses, borders, np.array([view.near for view in scene.views]))
-
-
-def space_of(config: Config) -> SpaceMap:
-    """How the scene fills the cube of the field."""
-    return Contraction() if config.contracted else Box()
-
-
 def has_background_model(config: Config, scene: "Scene") -> bool:
     """Whether something is seen at infinity: where space has no end, and no alpha tells what is seen of it."""
-    return bool(config.contracted) and not scene.has_alpha
+    return config.space != "bounded" and not scene.has_alpha

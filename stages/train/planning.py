@@ -22,6 +22,7 @@ from stages.io.photos import read_photos
 from stages.train.config import SECONDS, Config
 from stages.train.data import MIN_LONG_SIDE, camera_directions
 from stages.train.fields.field_list import field_of, make_trainer
+from stages.train.fields.space import chosen_space
 from stages.train.more import continued, finished_training_folder
 from stages.train.precision import chosen_precision
 
@@ -48,8 +49,11 @@ def planned(config: Config, inputs: Inputs, progress: Progress) -> Config:
     preset = config.preset or "standard"
     seconds = SECONDS[preset] if config.steps is None and config.seconds is None else config.seconds
     config = config.model_copy(update={"field": config.kind, "preset": preset, "seconds": seconds})
-    decided = {"contracted": "background" in decisions.on, "view_dependence": "view_dependence" in decisions.on}
-    config = config.filled(decided)
+    config = config.filled({"view_dependence": "view_dependence" in decisions.on})
+    if config.space is None:
+        space, why = chosen_space(decisions, scene)
+        config = config.filled({"space": space})
+        progress.note("train.space", f"space {why}")
     field = field_of(config)
     config = field.prepared(field.with_defaults(config), progress)
     if config.matmul is None:

@@ -240,7 +240,7 @@ def test_nan_is_a_failure_reason(inputs: dict[str, Path], progress: Any) -> None
 
 def train_loop_trainer(inputs: dict[str, Path], dataset: RayDataset) -> HashGridTrainer:
     asked = train.Config(downscale=1.0, steps=1, grid=HashGridOptions(**GRID, micro_batches=1, backend="torch"))
-    config = with_defaults(asked.model_copy(update={"contracted": False, "view_dependence": True}))
+    config = with_defaults(asked.model_copy(update={"space": "bounded", "view_dependence": True}))
     trainer = make_trainer(config, read_scene(inputs["normalise"]), dataset, 0)
     assert isinstance(trainer, HashGridTrainer)
     return trainer

@@ -6,12 +6,15 @@ from torch import Tensor
 from nerf.fields.positional_encoding import positional_encoding
 from nerf.geometry.contraction import contract, uncontract
 from nerf.geometry.rays import Rays, clip_to_box, points_on
+from nerf.geometry.space_maps import MIN_DEPTH, Ndc
 from nerf.kernels import BOX, CONTRACTED_BOX, Backend, RayStepping, Samples
 from nerf.kernels.torch.marching import s_to_t, t_to_s
 from pipeline.doctor.numerics import Bound, Case
 
 OCTAVES = 16
 FOLDED = RayStepping(step_size=0.002, cone_angle=0.008, contracted=True, occupancy_resolution=128, max_samples=1024)
+NDC = Ndc((0.25, -2.0, 0.125), ((0.36, 0.48, -0.8), (-0.8, 0.6, 0.0), (0.48, 0.64, 0.6)), (0.75, 0.5), 0.75)
+NEAREST = MIN_DEPTH * NDC.near
 PER_RAY = 4
 
 
@@ -43,6 +46,42 @@ def _folded(x: Tensor) -> Tensor:
 def _unfolded(y: Tensor) -> Tensor:
     m = y.abs().amax(-1, keepdim=True)
     return torch.where(m > 1, y / (m.clamp(min=1) * (2 - m)), y)
+
+
+def _in_ndc(x: Tensor) -> Tensor:
+    """Normalised device coordinates with points before the near plane where a thousandth of its depth would be."""
+    right, down, depth = ((x - x.new_tensor(NDC.apex)) @ x.new_tensor(NDC.axes).T).unbind(-1)
+    depth = torch.where(depth > NEAREST, depth, NEAREST)
+    sideways = (each / depth / slope for each, slope in zip((right, down), NDC.slopes, strict=True))
+    return BOX * torch.stack([*sideways, 1 - 2 * NDC.near / depth], -1)
+
+
+def _from_ndc(y: Tensor) -> Tensor:
+    x, y, z = (y / BOX).unbind(-1)
+    depth = 2 * NDC.near / (1 - z)
+    local = torch.stack([x * NDC.slopes[0] * depth, y * NDC.slopes[1] * depth, depth], -1)
+    return local @ local.new_tensor(NDC.axes) + local.new_tensor(NDC.apex)
+
+
+def _ndc_rays() -> tuple[Tensor, Tensor, Tensor]:
+    """From about the apex forward, to distances of the scene beyond the near plane."""
+    towards = torch.nn.functional.normalize(uniform(2, -0.5, 0.5, 256, 3) + torch.tensor(NDC.axes[2]), dim=-1)
+    return torch.tensor(NDC.apex) + uniform(1, -0.5, 0.5, 256, 3), towards, decades(3, 0.4, 2, 256, 1)
+
+
+def _hard_ndc_rays() -> tuple[Tensor, Tensor, Tensor]:
+    """Along the axis, parallel to the image plane, from far behind, back to the near plane; to far away."""
+    right, _, forward = torch.tensor(NDC.axes)
+    apex = torch.tensor(NDC.apex)
+    origins = torch.stack([apex, apex + 2 * forward, apex - 100 * forward, apex + 50 * forward + right])
+    towards = torch.stack([forward, right, forward, -forward])
+    return origins, towards, torch.tensor([[1e6], [3.0], [1e4], [49.0]])
+
+
+def _on_mapped_rays(_: Backend, origins: Tensor, towards: Tensor, distance: Tensor) -> Tensor:
+    none = torch.zeros_like(distance[:, 0])
+    mapped = NDC.map_rays(Rays(origins, towards, none, none + 1e7))
+    return points_on(mapped.rays, mapped.from_scene(distance[:, 0])[:, None])[:, 0]
 
 
 def _samples(t: Tensor) -> Samples:
@@ -213,6 +252,54 @@ CASES = [
         value=Bound(5e-7, "itself"),
         gradient=Bound(5e-6, "row"),
         differentiable=1,
+    ),
+    Case(
+        formula="normalised device coordinates (x/z, y/z, 1 − 2 n/z)",
+        where="nerf/geometry/space_maps.py: Ndc.forward, Ndc.pull_back",
+        domain="all finite points",
+        hazard="infinite at z = 0, folded back behind it",
+        answer="z is n/1000 at least: what is before the near plane or behind the camera is far outside of the cube",
+        tried="|x| < 3; at infinity, on the near plane, beside and behind the camera",
+        typical=lambda: (torch.tensor(NDC.apex) + uniform(1, -0.5, 3, 512, 3) @ torch.tensor(NDC.axes),),
+        extreme=lambda: (
+            torch.tensor(NDC.apex)
+            + torch.tensor([[0.3, 0.2, 0.75], [1.0, -2.0, 1e4], [1e19, 0, 1e20], [0.1, 0.1, -1.0], [100.0, 1.0, -1e3]])
+            @ torch.tensor(NDC.axes),
+        ),
+        function=lambda _, x: NDC.forward(x),
+        reference=_in_ndc,
+        value=Bound(1.5e-5, "row"),
+        gradient=Bound(3e-5, "row"),
+        differentiable=1,
+        backward=lambda _, grad, x: (NDC.pull_back(x, grad),),
+    ),
+    Case(
+        formula="their inverse, z = 2 n / (1 − z')",
+        where="nerf/geometry/space_maps.py: Ndc.inverse",
+        domain="max abs y_i < 0.9",
+        hazard="1 − z' cancels; infinite at the far face",
+        answer="1 − z' of two float32 numbers is exact near the far face; callers stay half a cell within it",
+        tried="|y| < 0.89; the middle, the near face, half a cell of 128 within the far face",
+        typical=lambda: (uniform(1, -0.89, 0.89, 512, 3),),
+        extreme=lambda: (torch.tensor([[0.0, 0.0, 0.0], [0.1, -0.2, -0.9], [0.5, 0.9, 0.893]]),),
+        function=lambda _, y: NDC.inverse(y),
+        reference=_from_ndc,
+        value=Bound(2e-5, "row"),
+        gradient=Bound(4e-5, "row"),
+        differentiable=1,
+    ),
+    Case(
+        formula="straight rays through them",
+        where="nerf/geometry/space_maps.py: Ndc.map_rays, MappedRays.from_scene",
+        domain="rays that come before the near plane",
+        hazard="the paper's z/(z + t) − 1 cancels far away; 0/0 for rays parallel to the image plane",
+        answer="distances over depth, t / z(t): finite in every direction",
+        tried="directions up to 45° off the axis, distances of 2.5 to 100; parallel, from far behind, backward, to 1e6",
+        typical=_ndc_rays,
+        extreme=_hard_ndc_rays,
+        function=_on_mapped_rays,
+        reference=lambda origins, towards, distance: _in_ndc(origins + distance * towards),
+        value=Bound(1e-5, "one"),
     ),
     Case(
         formula="o + t d",

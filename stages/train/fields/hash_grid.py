@@ -6,33 +6,36 @@ from typing import TYPE_CHECKING
 from nerf.effects import ImageEffects
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.mlp import HIDDEN
+from nerf.geometry.space_maps import SpaceMap
 from nerf.kernels import BOX, CONTRACTED_BOX
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from stages.amounts import bytes_in_words, short_count
 from stages.contract import Progress
+from stages.effects.decisions import Space
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.hardware.device import compute_device, cores
 from stages.hardware.memory import available_on
 from stages.train.config import Config
-from stages.train.data import has_background_model, space_of, training_background
+from stages.train.data import has_background_model, training_background
 from stages.train.fields.hash_grid_options import MAX_MICRO_BATCHES
+from stages.train.fields.space import map_without_scene, space_map_of
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
     from nerf.training.ray_dataset import RayDataset
 
 # At first; both fall while training. In contracted space a cell is met from farther away, and rays are longer.
-LEARNING_RATES = {"bounded": 2e-2, "contracted": 1e-2}
+LEARNING_RATES = {"bounded": 2e-2, "contracted": 1e-2, "ndc": 2e-2}
 # Colours that each micro-batch computes, so each core: half of what one takes does not depend on how many they are, and
 # fewer cost as long. In a box more of them go with its closer samples (docs/experiments/colour_samples.md).
-MICRO_BATCH_SAMPLES = {"bounded": 3 << 13, "contracted": 1 << 14}
+MICRO_BATCH_SAMPLES = {"bounded": 3 << 13, "contracted": 1 << 14, "ndc": 1 << 14}
 # The largest step, which a GPU takes as fast as a small one. Its gradients are sure enough for the larger rate
 # (docs/experiments/colour_samples.md).
 MAX_STEP_SAMPLES, LARGE_STEP_LEARNING_RATE = 1 << 18, 2e-2
-# Weight of the distortion loss (Barron et al. 2022, who take 1e-2) in contracted space, against fog and matter close
-# before the cameras; fog also costs most of the time (docs/experiments/distortion_loss.md). A box around an object
-# needs none.
-DISTORTION = 2e-3
+# Weight of the distortion loss (Barron et al. 2022, who take 1e-2 where distances go from 0 to 1, as about they do in
+# normalised device coordinates), against fog and matter close before the cameras; fog also costs most of the time
+# (docs/experiments/distortion_loss.md, docs/experiments/forward_facing.md). A box around an object needs none.
+DISTORTION = {"bounded": 0.0, "contracted": 2e-3, "ndc": 1e-2}
 # Weight at first of the loss at sparse points (docs/experiments/sparse_depth.md; Deng et al. 2022 take 0.1, too, of
 # another loss).
 DEPTH_LOSS = 0.1
@@ -40,9 +43,12 @@ DEPTH_LOSS = 0.1
 MIN_PHOTOS = 3
 # Cells along an axis of the coarsest grid: fewer where they have to fill all of contracted space
 # (docs/experiments/few_photos.md).
-BASE_RES = {"bounded": 16, "contracted": 8}
+BASE_RES = {"bounded": 16, "contracted": 8, "ndc": 8}
 # Samples along a ray (docs/experiments/ray_samples.md).
 MAX_STEPS = 576  # bounded scenes: steps along the diagonal of the box
+# Steps along the diagonal of normalised device coordinates, 1.7 times as many as from near to infinity: photos that
+# stand next to each other see a thing move by some pixel from one to the next (docs/experiments/forward_facing.md).
+NDC_STEPS = 256
 # Contracted space: steps in one of the finest cells, by how many of these along an axis it counts for at most. Finer
 # cells gain more by more rays than by closer samples (docs/experiments/cell_sizes.md).
 STEPS_PER_CELL = {512: 3, 2048: 1.5}
@@ -50,15 +56,16 @@ EVEN_UNTIL = 0.25  # contracted space: scene units from the camera up to which s
 # Contracted space: at the shortest steps so many samples reach to a distance of 23; --train.grid.ray-samples may ask
 # for more.
 MAX_SAMPLES = 1024
-SAMPLES_PER_RAY = {"bounded": 3, "contracted": 10}
+SAMPLES_PER_RAY = {"bounded": 3, "contracted": 10, "ndc": 6}
 """Colours computed for a ray, over a run: measured on lego_400 and five photo sets (docs/results.md)."""
 SIZES = {
     "bounded": ((50e6, 5, 18, 512), (0, 4, 17, 256)),
     "contracted": ((30e6, 6, 18, 1024), (0, 5, 17, 512)),
+    "ndc": ((30e6, 6, 18, 1024), (0, 5, 17, 512)),
 }
 """(computed colours from which on it pays, num_levels, log2_hashmap_size, most max_res), the largest first."""
 # The same on a GPU, which reads a large table as fast as a small one.
-GPU_SIZES = {"bounded": (200e6, 8, 20, 1024), "contracted": (200e6, 8, 20, 2048)}
+GPU_SIZES = {"bounded": (200e6, 8, 20, 1024), "contracted": (200e6, 8, 20, 2048), "ndc": (200e6, 8, 20, 2048)}
 MIN_MAX_RES = 128
 MAX_MEMORY_SHARE = 0.5  # of what is free: what training may take of it
 TABLE_COPIES = 6  # of the grids' features: themselves, their gradient, Adam's two moments, and twice in a checkpoint
@@ -68,9 +75,9 @@ SAMPLE_BYTES = 4096  # that a sample of a step takes while it is computed
 def with_defaults(config: Config) -> Config:
     """``config`` with what this field is usually trained with where it leaves that open."""
     gpu, micro_batches = compute_device() == "cuda", config.grid.micro_batches or min(MAX_MICRO_BATCHES, cores())
-    most = MAX_STEP_SAMPLES if gpu else min(MAX_STEP_SAMPLES, micro_batches * MICRO_BATCH_SAMPLES[config.space])
+    most = MAX_STEP_SAMPLES if gpu else min(MAX_STEP_SAMPLES, micro_batches * MICRO_BATCH_SAMPLES[_space(config)])
     samples = config.grid.target_samples or most
-    rate = LARGE_STEP_LEARNING_RATE if samples >= MAX_STEP_SAMPLES else LEARNING_RATES[config.space]
+    rate = LARGE_STEP_LEARNING_RATE if samples >= MAX_STEP_SAMPLES else LEARNING_RATES[_space(config)]
     grid = {"target_samples": samples, "micro_batches": micro_batches}
     return config.filled({"background": "random", "learning_rate": rate, "grid": grid})
 
@@ -93,13 +100,13 @@ def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress |
     ones, and ``progress`` is told. The finest cells are about as wide as a pixel where the region of interest fills the
     photo."""
     assert config.downscale is not None
-    samples, device = rays * SAMPLES_PER_RAY[config.space], compute_device()
-    sizes = SIZES[config.space]
+    samples, device = rays * SAMPLES_PER_RAY[_space(config)], compute_device()
+    sizes = SIZES[_space(config)]
     if device == "cuda":
-        sizes = (GPU_SIZES[config.space], *sizes)
+        sizes = (GPU_SIZES[_space(config)], *sizes)
     cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
     pixels = max(max(camera.width, camera.height) for camera in cameras) / config.downscale
-    across = 2 ** math.ceil(math.log2(pixels * (CONTRACTED_BOX / BOX if config.contracted else 1)))
+    across = 2 ** math.ceil(math.log2(pixels * (CONTRACTED_BOX / BOX if config.space == "contracted" else 1)))
     wanted, *smaller = (
         _size(levels, log2_size, max(MIN_MAX_RES, min(most, across)))
         for least, levels, log2_size, most in sizes
@@ -121,6 +128,12 @@ def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress |
     return config.filled({"grid": chosen})
 
 
+def _space(config: Config) -> Space:
+    """Whose measured constants count."""
+    assert config.space is not None, "plan() chooses it"
+    return config.space
+
+
 def _size(num_levels: int, log2_hashmap_size: int, max_res: int) -> dict[str, int]:
     return {"num_levels": num_levels, "log2_hashmap_size": log2_hashmap_size, "max_res": max_res}
 
@@ -131,19 +144,19 @@ def _grids(size: dict[str, int]) -> str:
 
 def timed(config: Config, device: str) -> Config:
     """``config`` under which speed is measured before sizes are known: those which most budgets get."""
-    _, *size = SIZES[config.space][0]
+    _, *size = SIZES[_space(config)][0]
     return config.filled({"grid": _size(*size)})
 
 
 def rays_per_step(config: Config) -> float:
     """Rays of one step, expected from the colours that it computes."""
     assert config.grid.target_samples is not None, "plan() chooses it"
-    return config.grid.target_samples / SAMPLES_PER_RAY[config.space]
+    return config.grid.target_samples / SAMPLES_PER_RAY[_space(config)]
 
 
 def work(config: Config, rays: float) -> str:
     """What so many rays take, beside drawing them."""
-    return f" and compute {short_count(rays * SAMPLES_PER_RAY[config.space])} colours"
+    return f" and compute {short_count(rays * SAMPLES_PER_RAY[_space(config)])} colours"
 
 
 def memory_bytes(config: Config, workers: int) -> float:
@@ -182,9 +195,13 @@ def step_in_words(config: Config) -> str:
     stepping = field_settings(config, sky=False).stepping
     cone = f", from {stepping.linear_until:g} on every {stepping.cone_angle:.1%} of the distance"
     growing = cone if stepping.cone_angle else ""
+    if config.space == "ndc":
+        places = f"samples every {stepping.step_size / (2 * BOX):.2%} of 1 / depth from near to infinity"
+    else:
+        places = f"samples every {stepping.step_size:.2g} scene units{growing}"
     parts = f"{grid.micro_batches} micro-batch{'' if grid.micro_batches == 1 else 'es'}"
     step = f"{grid.target_samples:,} colours a step in {parts}, by {grid.backend}"
-    return f"{step} · samples every {stepping.step_size:.2g} scene units{growing}"
+    return f"{step} · {places}"
 
 
 def make_trainer(
@@ -193,25 +210,27 @@ def make_trainer(
     """A fresh field with its trainer, where ``dataset`` is."""
     assert config.grid.backend, "plan() chooses it"
     backend = load_backend(config.grid.backend, dataset.device.type)
-    model = HashGridField(field_settings(config, has_background_model(config, scene)), seed, backend).to(dataset.device)
+    settings = field_settings(config, has_background_model(config, scene), space_map_of(config, scene))
+    model = HashGridField(settings, seed, backend).to(dataset.device)
     return HashGridTrainer(model, dataset, _trainer_settings(config, scene, seed), effects)
 
 
-def field_settings(config: Config, sky: bool) -> HashGridSettings:
+def field_settings(config: Config, sky: bool, space: SpaceMap | None = None) -> HashGridSettings:
     """Sizes of the field. Samples stand as close as the finest cells can tell them apart: in contracted space a third
     to two thirds of a cell near the camera, growing with the distance, as pixels do; in a box a cell, or MAX_STEPS in
-    all."""
+    all. Sizes and steps alone need no ``space`` of a scene."""
     grid = config.grid
     assert grid.num_levels and grid.log2_hashmap_size and grid.max_res, "plan() chooses them"
-    assert config.contracted is not None and config.view_dependence is not None, "plan() takes them from stage effects"
+    assert config.space is not None and config.view_dependence is not None, "plan() chooses them"
+    steps = NDC_STEPS if config.space == "ndc" else min(math.sqrt(3) * grid.max_res, MAX_STEPS)
     shortest = 2 * CONTRACTED_BOX / (_steps_across(grid.max_res) * grid.ray_samples)
     return HashGridSettings(
         num_levels=grid.num_levels,
         log2_hashmap_size=grid.log2_hashmap_size,
-        base_res=min(BASE_RES[config.space], grid.max_res),
+        base_res=min(BASE_RES[_space(config)], grid.max_res),
         max_res=grid.max_res,
-        space=space_of(config),
-        diagonal_steps=max(1, round(grid.ray_samples * min(math.sqrt(3) * grid.max_res, MAX_STEPS))),
+        space=space or map_without_scene(config),
+        diagonal_steps=max(1, round(grid.ray_samples * steps)),
         min_step_size=shortest,
         cone_angle=shortest / EVEN_UNTIL,
         max_samples_per_ray=math.ceil(MAX_SAMPLES * max(1.0, grid.ray_samples)),
@@ -234,7 +253,7 @@ def _trainer_settings(config: Config, scene: "Scene", seed: int) -> HashGridTrai
         target_samples=grid.target_samples,
         micro_batches=grid.micro_batches,
         learning_rate=config.learning_rate,
-        distortion_weight=DISTORTION if config.contracted else 0.0,
+        distortion_weight=DISTORTION[_space(config)],
         depth_weight=DEPTH_LOSS,
         min_photos=MIN_PHOTOS,
     )

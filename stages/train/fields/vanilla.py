@@ -4,11 +4,13 @@ from typing import TYPE_CHECKING, Any
 
 from nerf.effects import ImageEffects
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
+from nerf.geometry.space_maps import SpaceMap
 from nerf.training.vanilla_trainer import CHUNK_RAYS, VanillaTrainer, VanillaTrainerSettings
 from stages.contract import Progress
 from stages.hardware.device import cores
 from stages.train.config import Config
-from stages.train.data import space_of, training_background
+from stages.train.data import training_background
+from stages.train.fields.space import map_without_scene, space_map_of
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
@@ -33,7 +35,7 @@ ACTIVATIONS_PER_LAYER = 2  # numbers kept of each unit for its gradient
 
 def with_defaults(config: Config) -> Config:
     """``config`` with what this field is usually trained with where it leaves that open."""
-    spacing = {"vanilla": {"spacing": "log" if config.contracted else "linear"}}
+    spacing = {"vanilla": {"spacing": "log" if config.space == "contracted" else "linear"}}
     sizes = PUBLISHED if config.preset == "paper" else REDUCED
     return config.filled({"background": "white"}).filled(spacing).filled(sizes)
 
@@ -72,7 +74,7 @@ def work(config: Config, rays: float) -> str:
 
 def memory_bytes(config: Config, workers: int) -> float:
     """Memory on the CPU that training takes beside the photos, so many chunks of work at a time."""
-    sizes = field_settings(config)
+    sizes = field_settings(config, map_without_scene(config))
     rays = min(CHUNK_RAYS["cpu"], rays_per_step(config))
     samples = rays * (2 * sizes.samples_coarse + sizes.samples_fine)
     return workers * ACTIVATIONS_PER_LAYER * 4 * samples * sizes.width * sizes.depth
@@ -111,14 +113,14 @@ def make_trainer(
 ) -> VanillaTrainer:
     """A fresh field with its trainer, where ``dataset`` is."""
     assert config.learning_rate is not None, "plan() chooses it"
-    model = VanillaNerf(field_settings(config), seed).to(dataset.device)
+    model = VanillaNerf(field_settings(config, space_map_of(config, scene)), seed).to(dataset.device)
     rates = (config.learning_rate, config.learning_rate * FINAL_LEARNING_RATE)
     settings = VanillaTrainerSettings(rays_per_step(config), seed, training_background(config, scene), *rates)
     return VanillaTrainer(model, dataset, settings, effects)
 
 
-def field_settings(config: Config) -> VanillaSettings:
+def field_settings(config: Config, space: SpaceMap) -> VanillaSettings:
     """Sizes and ablations of the field."""
-    assert config.contracted is not None and config.view_dependence is not None, "plan() takes them from stage effects"
+    assert config.view_dependence is not None, "plan() takes it from stage effects"
     sizes = config.vanilla.model_dump(exclude={"batch_rays"})
-    return VanillaSettings(space=space_of(config), view_dependence=config.view_dependence, **sizes)
+    return VanillaSettings(space=space, view_dependence=config.view_dependence, **sizes)

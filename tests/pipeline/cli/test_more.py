@@ -132,7 +132,7 @@ def test_a_training_of_another_version_is_not_gone_on_with(trained, capsys: pyte
     words = ["--more", "6steps", "--train.learning-rate", "0.02"]  # the workspace remembers the rate of another test
     assert run_command(["run", photos, "-o", workspace, "--until", "train", *words]) == 14
     said = capsys.readouterr().err
-    assert "is of another version of this program" in said and "without --more" in said
+    assert "another version of this program made" in said and "without --more" in said
     assert all(path.is_file() for path in before), "the finished training stays whole"
 
 

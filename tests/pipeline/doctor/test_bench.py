@@ -10,6 +10,7 @@ from nerf.training.hash_grid_trainer import ADAM_BYTES
 from pipeline import doctor
 from pipeline.cli import commands
 from pipeline.doctor import bench
+from stages.effects.decisions import Space
 from stages.train.fields.hash_grid import MICRO_BATCH_SAMPLES, SAMPLES_PER_RAY
 
 
@@ -43,12 +44,12 @@ def test_it_is_measured_only_if_asked_for(quick: None, capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize("space", ["bounded", "contracted"])
-def test_the_optimisers_share_follows_the_rays_per_step(space: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_optimisers_share_follows_the_rays_per_step(space: Space, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stages.train.fields.hash_grid.compute_device", lambda: "cpu")
     works = []
     for count in (1, 4):
         monkeypatch.setattr("stages.train.fields.hash_grid.cores", lambda count=count: count)
-        works.append(bench.grid_work(space == "contracted", 20))
+        works.append(bench.grid_work(space, 20))
     one, four = works
     assert one.streamed_bytes == pytest.approx(4 * four.streamed_bytes)
     assert (one.matmul_flops, one.gathered_rows) == (four.matmul_flops, four.gathered_rows)

@@ -156,7 +156,7 @@ def test_published_networks_have_their_rays_given_time() -> None:
 
 def test_a_first_training_at_a_size_reads_photos() -> None:
     runs = make_schedule(600, 1, "bounded", SIZES, FAST, 1000).runs
-    told = make_schedule(600, 1, "bounded", SIZES, FAST, 1000, ReadingTime(photos=5.0, crops=7.0)).runs
+    told = make_schedule(600, 1, "bounded", SIZES, FAST, 1000, ReadingTime(photos=5.0, scored=7.0)).runs
     more = {run.name: run.seconds for run in told}
     slower = [run.downscale for run in runs if run.name in more and more[run.name] == pytest.approx(run.seconds + 5)]
     assert sorted(slower) == list(SIZES)

@@ -23,16 +23,16 @@ def test_differences_are_taken_seed_by_seed() -> None:
     assert (encoding.difference, encoding.std) == (pytest.approx(-2.9), pytest.approx(0.2 / 2**0.5))
     assert encoding.words == "−2.90 ± 0.14 dB"
     assert (view.variant, view.words, view.std) == ("no view dependence", "−0.10 dB", None)
-    assert ablation_sentence(results, 1.0) == (
+    assert ablation_sentence(results, (640, 480)) == (
         "Against the complete reduced method, seed by seed, of 2 seeds (± their standard deviation): no positional "
         "encoding −2.90 ± 0.14 dB; no view dependence −0.10 dB; 1,000 steps each, trained on photos at a "
-        "quarter of the resolution, scored at full resolution."
+        "quarter of the resolution, scored at 640 × 480."
     )
 
 
 def test_without_its_counterpart_a_training_tells_no_difference() -> None:
     assert ablation_differences([result(REDUCED, 0, None), result(LEFT_OUT, 0, 17.0)]) == []
-    assert ablation_sentence([result(REDUCED, 0, 20.0), result(LEFT_OUT, 1, 17.0)], 1.0) is None
+    assert ablation_sentence([result(REDUCED, 0, 20.0), result(LEFT_OUT, 1, 17.0)], (640, 480)) is None
 
 
 def test_the_line_stands_under_the_pictures(tmp_path: Path) -> None:

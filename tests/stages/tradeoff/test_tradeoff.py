@@ -12,9 +12,11 @@ import torch
 from PIL import Image
 
 from nerf.geometry.scene import Camera
-from stages import tradeoff, train
+from stages import evaluate, tradeoff, train
 from stages.contract import StageError
 from stages.effects.decisions import Decisions, write_decisions
+from stages.evaluate import tiles
+from stages.evaluate.tiles import MIN_TILES
 from stages.io import stopwatch
 from stages.io.files import read_json, read_scene, write_json
 from stages.tradeoff import Config, benchmark, schedule, study
@@ -40,7 +42,7 @@ CONFIG: dict[str, Any] = {
     "space": "bounded",
     "downscale": 1.0,
     "sizes": (1.0,),
-    "crops": 3,
+    "tiles": 3,
 }
 
 
@@ -119,7 +121,7 @@ def test_what_is_planned_is_what_is_run(tmp_path: Path, photos: dict[str, Path],
     planned = tradeoff.plan(Config(seconds=60.0), photos, progress)
     assert planned.speeds and set(planned.speeds) == set(schedule.TIMED)
     assert all(steps > 0 and rays > steps for steps, rays in planned.speeds.values())
-    assert planned.sizes == (1.0, 1.0) and planned.downscale == 1.0
+    assert planned.sizes == (1.0, 1.0) and planned.downscale is None
 
 
 @pytest.mark.parametrize("unbounded, space", [(False, "bounded"), (True, "contracted")])
@@ -136,7 +138,7 @@ def test_a_study_keeps_the_scenes_space(
     write_decisions(tmp_path, Decisions({"background": {}} if unbounded else {}))
     planned = tradeoff.plan(Config(seconds=60.0), photos | {"effects": tmp_path}, progress)
     assert {planned.space} == {run.space for run in study.schedule_of(planned).runs} == {space}
-    assert planned.crops and 6 <= planned.crops <= 32
+    assert planned.tiles and 2 * MIN_TILES <= planned.tiles <= 512
     photos_take, windows_take = planned.reading
     assert 0 < photos_take < 5 and 0 < windows_take < 5
     assert Config.model_validate(planned.model_dump(mode="json")) == planned
@@ -343,25 +345,31 @@ def test_too_little_time_is_said_with_numbers(tmp_path: Path, photos: dict[str, 
         studied(tmp_path, photos, progress, seconds=2.0)
 
 
-def test_windows_are_parts_of_the_photos(photos: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(benchmark, "CROP_SIZE", 8)
+def test_tiles_are_parts_of_all_test_photos(photos: dict[str, Path]) -> None:
     scene = read_scene(photos["normalise"])
-    crops = benchmark.make_benchmark(photos["ingest"], scene, 1.0, 5, 2.0)
-    assert crops.frame == 24 * 16 and len(crops.crops) == 5
-    assert len({crop.photo for crop in crops.crops}) == 2
-    assert [photo.truth.shape for photo in crops.photos] == [(8, 12, 3)] * 2
-    for crop in crops.crops:
-        view = next(v for v in scene.views if v.name == crop.photo)
+    made = benchmark.make_benchmark(photos["ingest"], scene, None, 5, 2.0)
+    assert made.size == (24, 16) and [photo.truth.shape for photo in made.photos] == [(8, 12, 3)] * 2
+    assert [crop.photo for crop in made.crops] == [view.name for view in scene.of_split("test")]
+    for crop, view in zip(made.crops, scene.of_split("test"), strict=True):
         truth, rays = PhotoReader(photos["ingest"], scene, 1.0).pixels(view, WHITE), view_rays(scene, view, 1.0)
-        places = [
-            (y, x)
-            for y in range(9)
-            for x in range(17)
-            if torch.equal(rays.directions[y : y + 8, x : x + 8], crop.rays.directions)
-        ]
-        assert len(places) == 1
-        y, x = places[0]
-        assert torch.equal(truth[y : y + 8, x : x + 8], crop.truth)
+        for number, left in enumerate((0, 8)):  # two tiles of 16 × 16 cover 24 × 16
+            rows, columns = slice(16 * number, 16 * number + 16), slice(left, left + 16)
+            assert torch.equal(crop.truth[rows], truth[:, columns])
+            assert torch.equal(crop.rays.directions[rows], rays.directions[:, columns])
+
+
+def test_a_study_scores_as_evaluate_does(
+    tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tiles, "TILE_SIZE", 8)  # six cover a photo of 24 × 16 without overlap
+    own, scored = tmp_path / "train", tmp_path / "evaluate"
+    for folder in (own, scored):
+        folder.mkdir()
+    train.run(train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, own, progress)
+    facts = evaluate.run(evaluate.Config(fraction=1), photos | {"train": own}, scored, progress).facts
+    made = benchmark.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), None, 1000, 2.0)
+    figures = benchmark.score(own, made, progress)
+    assert figures["psnr"] == pytest.approx(facts["psnr"], abs=0.001)
 
 
 def test_large_photos_among_small_ones_are_drawn_small_and_whole(

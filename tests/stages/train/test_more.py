@@ -36,7 +36,7 @@ def inputs(tmp_path: Path) -> dict[str, Path]:
     write_json(inputs["normalise"] / "scene.json", photographed_large(scene).to_json())
     before = tmp_path / "w" / "train" / NAME.split("/")[0]
     before.mkdir(parents=True)
-    config = Config(steps=1000, downscale=2.0, contracted=False, view_dependence=False, **FIELD).model_dump()
+    config = Config(steps=1000, downscale=2.0, space="bounded", view_dependence=False, **FIELD).model_dump()
     manifest: dict[str, Any] = {"outputs_digest": DIGEST, "facts": {"train_seconds": 60.0}, "config": config}
     write_json(before / "manifest.json", manifest | {"inputs": dict.fromkeys(made, DIGEST)})
     write_json(before / "field.json", {"steps": 1000})

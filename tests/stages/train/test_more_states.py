@@ -21,7 +21,7 @@ def older_facts(folder: Path) -> None:
     save_checkpoint(folder / "checkpoints", Checkpoint(checkpoint.step, checkpoint.tensors, facts))
 
 
-def older_plan(folder: Path) -> None:
+def older_schedule(folder: Path) -> None:
     (folder / "schedule.json").write_text(json.dumps([[0, 40, 0.0, "begin", "of another version"]]))
 
 
@@ -33,8 +33,8 @@ def damaged(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (older_facts, "is of another version of this program"),
-        (older_plan, "is of another version of this program"),
+        (older_facts, "another version of this program made the training"),
+        (older_schedule, "another version of this program made the training"),
         (damaged, "cannot be read, only an earlier one"),
     ],
 )

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from nerf.fields.hash_grid import HashGridSettings
 from nerf.geometry.scene import Camera, Scene
 from stages.contract import Progress
-from stages.effects.decisions import Decisions
+from stages.effects.decisions import Decisions, Space
 from stages.train import Config
 from stages.train.data import MIN_LONG_SIDE, has_background_model, scaled_size
 from stages.train.fields.field_list import with_defaults
@@ -87,7 +87,7 @@ def test_redundant_photos_are_not_reduced_endlessly(scene: Scene) -> None:
 
 GRID = Config(
     steps=100,
-    contracted=False,
+    space="bounded",
     view_dependence=True,
     learning_rate=1e-2,
     background="random",
@@ -95,7 +95,7 @@ GRID = Config(
 )
 VANILLA = Config(
     seconds=10.0,
-    contracted=False,
+    space="bounded",
     view_dependence=True,
     learning_rate=5e-3,
     vanilla=VanillaOptions(depth=1, width=8, skip=1, samples_coarse=2, samples_fine=2, spacing="linear", batch_rays=64),
@@ -116,7 +116,7 @@ def test_the_speed_is_measured_on_this_machine(config: Config, tmp_path: Path, m
 
 def test_a_budget_of_steps_is_counted_not_timed(scene: Scene) -> None:
     assert rays_in_budget(VANILLA.model_copy(update={"steps": 5, "seconds": None}), scene, Decisions()) == 5 * 64
-    spaces = [GRID.model_copy(update={"contracted": contracted}) for contracted in (False, True)]
+    spaces = [GRID.model_copy(update={"space": space}) for space in ("bounded", "contracted")]
     in_box, folded = (rays_in_budget(config, scene, Decisions()) for config in spaces)
     assert 100 * 4096 / 100 < folded < in_box < 100 * 4096
 
@@ -132,7 +132,7 @@ def sizes_in(grid: HashGridOptions) -> dict[str, int]:
 
 @given(st.floats(1e3, 1e9), st.floats(1, 100), st.floats(1, 20), st.booleans())
 def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: float, down: float, folded: bool) -> None:
-    sized, config = of_size(scene, 3000, 2000), GRID.model_copy(update={"contracted": folded})
+    sized, config = of_size(scene, 3000, 2000), GRID.model_copy(update={"space": "contracted" if folded else "bounded"})
 
     def chosen(rays: float, downscale: float) -> dict[str, int]:
         return sizes_of(config.model_copy(update={"downscale": downscale}), sized, rays)
@@ -155,7 +155,7 @@ def test_a_gpu_has_larger_fields_and_takes_larger_steps(
     scene: Scene, folded: bool, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     grid = HashGridOptions(micro_batches=2)
-    config = Config(grid=grid, contracted=folded, view_dependence=True, downscale=1.0)
+    config = Config(grid=grid, space="contracted" if folded else "bounded", view_dependence=True, downscale=1.0)
     large = of_size(scene, 4000, 3000)
     on_cpu = sizes_of(with_defaults(config), large, 1e9), with_defaults(config)
     monkeypatch.setattr("stages.train.fields.hash_grid.compute_device", lambda: "cuda")
@@ -176,14 +176,17 @@ def test_a_gpu_has_larger_fields_and_takes_larger_steps(
 
 @pytest.mark.parametrize("folded", [True, False])
 def test_every_core_has_an_equal_part(folded: bool) -> None:
-    parts = [with_defaults(with_grid(Config(contracted=folded), micro_batches=count)) for count in (1, 2, 64)]
+    parts = [
+        with_defaults(with_grid(Config(space="contracted" if folded else "bounded"), micro_batches=count))
+        for count in (1, 2, 64)
+    ]
     sizes = [part.grid.target_samples or 0 for part in parts]
     assert sizes == [MICRO_BATCH_SAMPLES[parts[0].space], 2 * sizes[0], MAX_STEP_SAMPLES]
     assert parts[2].learning_rate == LARGE_STEP_LEARNING_RATE >= (parts[1].learning_rate or 1)
 
 
 def test_samples_follow_occupied_cells() -> None:
-    folded = Config(contracted=True, view_dependence=True, grid=HashGridOptions(num_levels=1, log2_hashmap_size=8))
+    folded = Config(space="contracted", view_dependence=True, grid=HashGridOptions(num_levels=1, log2_hashmap_size=8))
     sizes = (with_grid(folded, max_res=max_res) for max_res in (256, 512, 700, 1024, 2048, 4096))
     fields = [field_settings(config, sky=False) for config in sizes]
     steps = [field.min_step_size for field in fields]
@@ -191,11 +194,11 @@ def test_samples_follow_occupied_cells() -> None:
     assert all(field.cone_angle == field.min_step_size / 0.25 for field in fields)
 
 
-@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize("space", ["bounded", "contracted", "ndc"])
 @given(factor=st.floats(0.25, 4.0))
-def test_ray_samples_multiply_the_samples_along_a_ray(contracted: bool, factor: float) -> None:
+def test_ray_samples_multiply_the_samples_along_a_ray(space: Space, factor: float) -> None:
     config = with_grid(GRID, num_levels=4, log2_hashmap_size=16, max_res=512)
-    config = config.model_copy(update={"contracted": contracted})
+    config = config.model_copy(update={"space": space})
     usual = field_settings(config, sky=False)
     asked = field_settings(with_grid(config, ray_samples=factor), sky=False)
     assert asked.diagonal_steps == pytest.approx(factor * usual.diagonal_steps, abs=0.5)
@@ -206,10 +209,10 @@ def test_ray_samples_multiply_the_samples_along_a_ray(contracted: bool, factor: 
 
 
 @pytest.mark.parametrize("has_alpha", [False, True])
-@pytest.mark.parametrize("contracted", [False, True])
-def test_unbounded_space_without_alpha_has_a_background(scene: Scene, contracted: bool, has_alpha: bool) -> None:
-    config = GRID.model_copy(update={"contracted": contracted})
-    assert has_background_model(config, replace(scene, has_alpha=has_alpha)) is (contracted and not has_alpha)
+@pytest.mark.parametrize("space", ["bounded", "contracted", "ndc"])
+def test_unbounded_space_without_alpha_has_a_background(scene: Scene, space: Space, has_alpha: bool) -> None:
+    config = GRID.model_copy(update={"space": space})
+    assert has_background_model(config, replace(scene, has_alpha=has_alpha)) is (space != "bounded" and not has_alpha)
 
 
 def test_the_reason_for_sizes_is_the_budget() -> None:
@@ -218,7 +221,7 @@ def test_the_reason_for_sizes_is_the_budget() -> None:
     assert reason(VANILLA, 950) == "10 s on this machine draw about 950 rays: sizes left open are chosen for that"
 
 
-FOLDED = GRID.model_copy(update={"contracted": True, "downscale": 1.0})
+FOLDED = GRID.model_copy(update={"space": "contracted", "downscale": 1.0})
 LARGEST, SMALLEST = (
     {"num_levels": levels, "log2_hashmap_size": log2_size, "max_res": max_res}
     for levels, log2_size, max_res in ((6, 18, 1024), (5, 17, 512))

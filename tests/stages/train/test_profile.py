@@ -200,6 +200,6 @@ def test_the_file_is_written_where_a_step_was_timed(tmp_path: Path, monkeypatch:
 
 def test_hash_grid_rates_are_at_its_table_size() -> None:
     grid = HashGridOptions(num_levels=2, log2_hashmap_size=8, max_res=64)
-    config = Config(grid=grid, contracted=False, view_dependence=True)
+    config = Config(grid=grid, space="bounded", view_dependence=True)
     rows = field_of(config).table_rows(config)
     assert (field_of(config).matmul_width(config), rows) == (64, field_settings(config, sky=False).layout.rows)

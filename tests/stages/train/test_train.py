@@ -263,7 +263,7 @@ def test_plan_answers_everything_for_the_grid_field(
     monkeypatch.setattr("stages.train.planning.TIMED_SECONDS", 0.01)
     inputs, _ = photographed(tmp_path, bounded=bounded)
     planned = train.plan(Config(), inputs, progress)
-    assert (planned.field, planned.seconds, planned.contracted) == ("grid", 180, not bounded)
+    assert (planned.field, planned.seconds, planned.space) == ("grid", 180, "bounded" if bounded else "contracted")
     assert any(note.startswith("180 s on this machine draw about ") for note in progress.notes)
     assert (planned.downscale, planned.background) == (1.0, "random")
     assert None not in planned.grid.model_dump().values()
@@ -303,7 +303,7 @@ def test_plan_answers_everything_for_the_vanilla_field(
     assert (sizes.depth, sizes.width, sizes.samples_coarse, sizes.samples_fine) == (4, 64, 32, 32)
     assert (sizes.batch_rays, planned.learning_rate) == (8, 5e-3)
     assert (planned.seconds, planned.steps) == (180, None)
-    assert (planned.contracted, sizes.spacing, planned.downscale) == (False, "linear", 1.0)
+    assert (planned.space, sizes.spacing, planned.downscale) == ("bounded", "linear", 1.0)
     assert train.plan(Config.model_validate(planned.model_dump()), inputs, progress) == planned
 
 
@@ -328,7 +328,7 @@ def test_the_published_preset_is_the_published_model(tmp_path: Path, progress: P
     assert (sizes.depth, sizes.width, sizes.skip) == (8, 128, 4)
     assert (sizes.samples_coarse, sizes.samples_fine) == (64, 128)
     assert (sizes.batch_rays, planned.learning_rate) == (1024, 5e-4)
-    assert (planned.contracted, sizes.spacing) == (True, "log")
+    assert (planned.space, sizes.spacing) == ("contracted", "log")
 
 
 def test_every_seed_is_measured_on_the_same_pixels(tmp_path: Path, progress) -> None:

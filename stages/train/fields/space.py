@@ -1,0 +1,68 @@
+"""How a scene fills the cube of its field: chosen by what stage effects decided and how the cameras stand."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nerf.geometry.space_maps import MAX_ANGLE_DEG, Box, Contraction, Ndc, SpaceMap, enclosing_ndc
+from stages.contract import StageError
+from stages.sfm.colmap.cameras import border_rays
+from stages.train.config import Config
+
+if TYPE_CHECKING:
+    from nerf.geometry.scene import Scene
+    from stages.effects.decisions import Decisions, Space
+
+# Of a pyramid, in photos: in a wider one cells are coarser than the contraction's, whose cube has the region of
+# interest in 0.45 of its width (docs/experiments/forward_facing.md).
+MAX_WIDTH = 2.0
+
+
+def chosen_space(decisions: "Decisions", scene: "Scene") -> tuple["Space", str]:
+    """The space that a field is to have, and the reason in words."""
+    if "background" not in decisions.on:
+        return "bounded", "bounded: nothing is seen beyond the region of interest"
+    if scene.capture_type != "forward":
+        return "contracted", "contracted: the background is unbounded, and the photos do not face one way"
+    pyramid = enclosing_pyramid(scene)
+    if pyramid is None:
+        return "contracted", "contracted: the photos face one way, but some look aside too far for a pyramid"
+    width = width_in_photos(pyramid, scene)
+    spread = f"a pyramid {width:.1f} times as wide as a photo holds all they see"
+    if width > MAX_WIDTH:
+        return "contracted", f"contracted: the photos face one way, but only {spread}"
+    return "ndc", f"normalised device coordinates: the photos face one way, and {spread}"
+
+
+def space_map_of(config: Config, scene: "Scene") -> SpaceMap:
+    """The map of the space that ``config`` names, for this scene. Raises StageError where there is none."""
+    if config.space != "ndc":
+        return map_without_scene(config)
+    if (pyramid := enclosing_pyramid(scene)) is None:
+        why = f"some photos look more than {MAX_ANGLE_DEG:g} degrees aside from where they look on average"
+        hint = "Leave out --train.space ndc."
+        raise StageError("train.no-pyramid", "cannot train in normalised device coordinates", why, hint)
+    return pyramid
+
+
+def map_without_scene(config: Config) -> SpaceMap:
+    """A map that is marched by the same steps, for where there is no scene: the box for normalised device
+    coordinates."""
+    assert config.space is not None, "plan() chooses it"
+    return Contraction() if config.space == "contracted" else Box()
+
+
+def enclosing_pyramid(scene: "Scene") -> Ndc | None:
+    """The space of cameras that face one way, all photos of the scene counted: what test photos show is in it, too.
+    None where they do not face one way."""
+    of_cameras = [border_rays(camera) for camera in scene.cameras]
+    poses = np.stack([view.scene_from_camera for view in scene.views])
+    borders = [of_cameras[view.camera] for view in scene.views]
+    return enclosing_ndc(poses, borders, np.array([view.near for view in scene.views]))
+
+
+def width_in_photos(pyramid: Ndc, scene: "Scene") -> float:
+    """How many times as wide as a photo the pyramid is at infinity, along the axis where that is more."""
+    rays = [border_rays(camera) for camera in scene.cameras]
+    own = np.median([np.abs(ray[:, :2] / ray[:, 2:]).max(0) for ray in rays], axis=0)
+    return float((np.array(pyramid.slopes) / own).max())

@@ -1,0 +1,112 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from nerf.geometry.scene import Camera, Scene, Similarity, View
+from nerf.geometry.space_maps import Box, Contraction, Ndc
+from nerf.training.ray_dataset import ray_dataset_from_images
+from stages.effects.decisions import Decisions
+from stages.train.config import Config
+from stages.train.data import camera_directions
+from stages.train.fields.field_list import make_trainer, with_defaults
+from stages.train.fields.space import MAX_WIDTH, chosen_space, space_map_of, width_in_photos
+from tests.camera_layouts import ring, wall
+from tests.refusals import refused
+
+CAMERA = Camera("PINHOLE", 40, 30, (40.0, 40.0, 20.0, 15.0))
+UNBOUNDED = Decisions({"background": {}})
+SMALL = {
+    "grid": {"num_levels": 2, "log2_hashmap_size": 10, "max_res": 32, "target_samples": 512, "micro_batches": 1},
+    "vanilla": {"depth": 2, "width": 8, "samples_coarse": 4, "samples_fine": 4, "batch_rays": 32},
+}
+
+
+def scene_of(poses: np.ndarray, capture_type="forward") -> Scene:
+    views = tuple(
+        View(f"{i}.jpg", f"{i}.jpg", 0, pose, 0.5, 20.0, "test" if i % 8 == 0 else "train")
+        for i, pose in enumerate(poses)
+    )
+    return Scene((CAMERA,), views, Similarity(1.0, np.eye(3), np.zeros(3)), False, False, capture_type, True)
+
+
+def fanned(spread_deg: float) -> np.ndarray:
+    """Eleven cameras in one place, turned about the vertical by up to so much to either side of +y."""
+    poses = np.repeat(wall()[:1], 11, axis=0)
+    for angle, pose in zip(np.radians(np.linspace(-spread_deg, spread_deg, 11)), poses, strict=True):
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        pose[:, :3] = turn @ pose[:, :3]
+    return poses
+
+
+def test_cameras_that_face_one_way_get_ndc() -> None:
+    scene = scene_of(wall())
+    space, why = chosen_space(UNBOUNDED, scene)
+    assert space == "ndc" and "1.0 times" in why
+    pyramid = space_map_of(Config(space="ndc"), scene)
+    assert isinstance(pyramid, Ndc)
+    np.testing.assert_allclose(pyramid.slopes, (19.5 / 40, 14.5 / 40))
+    assert width_in_photos(pyramid, scene) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("decisions", "scene", "space"),
+    [
+        (Decisions(), scene_of(wall()), "bounded"),
+        (UNBOUNDED, scene_of(ring(), "around"), "contracted"),
+        (UNBOUNDED, scene_of(fanned(10.0)), "ndc"),
+        (UNBOUNDED, scene_of(fanned(30.0)), "contracted"),
+        (UNBOUNDED, scene_of(fanned(60.0)), "contracted"),
+    ],
+    ids=["no background", "all round", "a little aside", "too wide", "no pyramid"],
+)
+def test_the_space_follows_background_and_cameras(decisions: Decisions, scene: Scene, space: str) -> None:
+    chosen, why = chosen_space(decisions, scene)
+    assert chosen == space and why.startswith("normalised" if space == "ndc" else space)
+
+
+def test_the_width_decides_between_two_pyramids() -> None:
+    widths = []
+    for spread in (10.0, 30.0):
+        scene = scene_of(fanned(spread))
+        pyramid = space_map_of(Config(space="ndc"), scene)
+        assert isinstance(pyramid, Ndc)
+        widths.append(width_in_photos(pyramid, scene))
+    assert 1 < widths[0] < MAX_WIDTH < widths[1]
+
+
+def test_an_option_forces_a_space() -> None:
+    scene = scene_of(wall())
+    assert space_map_of(Config(space="bounded"), scene) == Box()
+    assert space_map_of(Config(space="contracted"), scene) == Contraction()
+    with refused("train.no-pyramid"):
+        space_map_of(Config(space="ndc"), scene_of(ring()))
+
+
+@pytest.mark.parametrize("field", ["grid", "vanilla"])
+def test_both_fields_train_in_ndc(field: str) -> None:
+    scene = scene_of(wall())
+    views = scene.of_split("train")
+    grey = [torch.full((30, 40, 3), 128, dtype=torch.uint8)] * len(views)
+    poses = torch.tensor(np.stack([view.scene_from_camera for view in views]), dtype=torch.float32)
+    ends = torch.full((len(views),), 0.5), torch.full((len(views),), 20.0)
+    dataset = ray_dataset_from_images(grey, [0] * len(views), [camera_directions(CAMERA, 1.0)], poses, *ends)
+    config = Config(field=field, space="ndc", view_dependence=True, **{field: SMALL[field]})  # pyright: ignore
+    config = with_defaults(config)
+    if field == "grid":
+        config = config.filled({"grid": {"backend": "torch"}})
+    trainer = make_trainer(config, scene, dataset, 0)
+    errors = [trainer.step(step, step / 60).psnr for step in range(60)]
+    assert isinstance(trainer.model.settings.space, Ndc)  # pyright: ignore
+    assert errors[-1] > errors[0] + 3
+
+
+def test_a_moved_scene_has_a_moved_pyramid() -> None:
+    """The map belongs to the cameras, wherever the frame has its origin."""
+    scene = scene_of(wall())
+    moved = [replace(view, scene_from_camera=view.scene_from_camera + np.eye(3, 4, 3)) for view in scene.views]
+    here, there = (space_map_of(Config(space="ndc"), each) for each in (scene, replace(scene, views=tuple(moved))))
+    assert isinstance(here, Ndc) and isinstance(there, Ndc)
+    np.testing.assert_allclose(np.subtract(there.apex, here.apex), [1.0, 0.0, 0.0], atol=1e-9)
+    assert there.near == pytest.approx(here.near)
