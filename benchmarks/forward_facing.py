@@ -38,7 +38,7 @@ from stages.train.fields.hash_grid import (
     LEARNING_RATES,
     MAX_STEPS,
     MIN_PHOTOS,
-    NDC_STEPS,
+    NDC_STEPS_PER_CELL,
 )
 from stages.train.fields.space import enclosing_pyramid
 
@@ -68,7 +68,7 @@ def variants(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
         space = SPACES[run["map"]]
         usual = {
             "distortion": DISTORTION[space],
-            "diagonal_steps": NDC_STEPS if space == "ndc" else MAX_STEPS,
+            "diagonal_steps": round(NDC_STEPS_PER_CELL * run["max_res"]) if space == "ndc" else MAX_STEPS,
             "learning_rate": LEARNING_RATES[space],
         }
         unused = {"contraction": {"diagonal_steps": None}, "box": {"distortion": None}}.get(run["map"], {})

@@ -46,9 +46,10 @@ MIN_PHOTOS = 3
 BASE_RES = {"bounded": 16, "contracted": 8, "ndc": 8}
 # Samples along a ray (docs/experiments/ray_samples.md).
 MAX_STEPS = 576  # bounded scenes: steps along the diagonal of the box
-# Steps along the diagonal of normalised device coordinates, 1.7 times as many as from near to infinity: photos that
-# stand next to each other see a thing move by some pixel from one to the next (docs/experiments/forward_facing.md).
-NDC_STEPS = 256
+# Steps along the diagonal of normalised device coordinates, 1.7 times as many as from near to infinity, for one of the
+# finest cells along an axis: photos that stand next to each other see a thing move by some pixel from one to the next
+# (docs/experiments/forward_facing.md).
+NDC_STEPS_PER_CELL = 1 / 4
 # Contracted space: steps in one of the finest cells, by how many of these along an axis it counts for at most. Finer
 # cells gain more by more rays than by closer samples (docs/experiments/cell_sizes.md).
 STEPS_PER_CELL = {512: 3, 2048: 1.5}
@@ -222,7 +223,8 @@ def field_settings(config: Config, sky: bool, space: SpaceMap | None = None) -> 
     grid = config.grid
     assert grid.num_levels and grid.log2_hashmap_size and grid.max_res, "plan() chooses them"
     assert config.space is not None and config.view_dependence is not None, "plan() chooses them"
-    steps = NDC_STEPS if config.space == "ndc" else min(math.sqrt(3) * grid.max_res, MAX_STEPS)
+    across = math.sqrt(3) * grid.max_res
+    steps = NDC_STEPS_PER_CELL * grid.max_res if config.space == "ndc" else min(across, MAX_STEPS)
     shortest = 2 * CONTRACTED_BOX / (_steps_across(grid.max_res) * grid.ray_samples)
     return HashGridSettings(
         num_levels=grid.num_levels,
