@@ -54,9 +54,9 @@ class Spoken:
     def update(self, message: str, done: float | None = None) -> None:
         """Say nothing."""
 
-    def note(self, message: str) -> None:
+    def note(self, code: str, text: str) -> None:
         """Say it."""
-        print(f"  {message}")
+        print(f"  {text}")
 
 
 def paint(folder: Path, photos: int) -> Scene:

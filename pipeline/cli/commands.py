@@ -382,7 +382,7 @@ def command_demo(words: Sequence[str]) -> int:
         display.begin("truth")
         *notes, last = demo.truth_lines(root / "output", photos)
         for text in notes:
-            display.note(text)
+            display.note("pipeline.truth", text)
         display.end("truth", last, time.monotonic() - started, cached=False)
         report = root / "output" / "report.html"
         display.finished(f"→ the report: {report}", {"report.html": report})

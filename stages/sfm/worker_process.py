@@ -56,7 +56,7 @@ def run_worker(
                 _hand_over(child.stdin, job)
                 for message in map(json.loads, child.stdout):
                     if note := message.pop("note", None):
-                        progress.note(note)
+                        progress.note(*note)
                     begins = message.get("phase", latest["phase"]) != latest["phase"]
                     latest.update(message)
                     if begins:  # a phase may take less than the live line waits

@@ -118,7 +118,10 @@ def chosen(
     pairs = expected_pairs(matcher, count, neighbours)
     if matcher != "exhaustive":
         everything = expected_pairs("exhaustive", count, neighbours)
-        progress.note(f"{count} photos have {everything:,} pairs: {WAYS[matcher].format(neighbours)}, about {pairs:,}")
+        progress.note(
+            "sfm.pair-selection",
+            f"{count} photos have {everything:,} pairs: {WAYS[matcher].format(neighbours)}, about {pairs:,}",
+        )
     if seconds_given is None or len(levels) == 1 or _max_seconds(count, pairs) <= MATCHING_FRACTION * seconds_given:
         return ChosenOptions(*levels[0], matcher)
     progress.update("measuring what features and matches of a few photos take")
@@ -129,7 +132,7 @@ def chosen(
             break
         if (shorter := _measured(photos, images, less, matcher).of(count, pairs)) <= MAX_TIME_RATIO * seconds:
             level, seconds = less, shorter
-    progress.note(_level_message(count, levels[0], level, full, seconds))
+    progress.note("sfm.quality-level", _level_message(count, levels[0], level, full, seconds))
     return ChosenOptions(*level, matcher)
 
 
