@@ -57,8 +57,8 @@ class Quiet:
 
     def update(self, message: str, done: float | None = None) -> None: ...
 
-    def note(self, message: str) -> None:
-        print(message)
+    def note(self, code: str, text: str) -> None:
+        print(text)
 
 
 class Bench(NamedTuple):

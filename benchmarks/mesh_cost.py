@@ -39,7 +39,7 @@ class Quiet:
     def update(self, message: str, done: float | None = None) -> None:
         """Nothing."""
 
-    def note(self, message: str) -> None:
+    def note(self, code: str, text: str) -> None:
         """Nothing."""
 
 

@@ -54,9 +54,9 @@ class Spoken:
     def update(self, message: str, done: float | None = None) -> None:
         """Say nothing."""
 
-    def note(self, message: str) -> None:
+    def note(self, code: str, text: str) -> None:
         """Say it."""
-        print(f"  {message}")
+        print(f"  {text}")
 
 
 def paint(folder: Path, photos: int) -> Scene:
@@ -72,7 +72,7 @@ def paint(folder: Path, photos: int) -> Scene:
             path.write_bytes((folder / f"images/{index % DIFFERENT:04d}.jpg").read_bytes())
         views.append(View(path.name, f"images/{path.name}", index, np.eye(3, 4), 1.0, 9.0, "train"))
     frame = Similarity(1.0, np.eye(3), np.zeros(3))
-    return Scene((camera,) * photos, tuple(views), frame, False, False, "inside", True)
+    return Scene((camera,) * photos, tuple(views), frame, False, False, "inside-out", True)
 
 
 def memory() -> dict[str, float]:

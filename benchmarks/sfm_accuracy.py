@@ -46,9 +46,9 @@ class Quiet:
     def update(self, message: str, done: float | None = None) -> None:
         """Say nothing."""
 
-    def note(self, message: str) -> None:
+    def note(self, code: str, text: str) -> None:
         """Print the note."""
-        print(f"  {message}")
+        print(f"  {text}")
 
 
 def errors(model: SparseModel, reference: dict[str, dict[str, list]]) -> tuple[np.ndarray, np.ndarray]:

@@ -44,9 +44,9 @@ class Timed:
         self.seconds[before] = self.seconds.get(before, 0.0) + now - since
         self.last = (kind, now)
 
-    def note(self, message: str) -> None:
+    def note(self, code: str, text: str) -> None:
         """Print the note."""
-        print(f"    {message}", flush=True)
+        print(f"    {text}", flush=True)
 
     def parts(self) -> str:
         """Seconds of each kind of line, rounded; they change twice a second."""

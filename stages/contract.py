@@ -117,6 +117,13 @@ def listed(names: Sequence[str], most: int) -> str:
     return ", ".join(names[:most]) + more
 
 
+class Note(NamedTuple):
+    """A line that stays: a decision and its reason, or a warning; ``code`` is its name for programs, as of errors."""
+
+    code: str
+    text: str
+
+
 class Progress(Protocol):
     """How a stage speaks while it works. Both calls are cheap and may be made from any thread."""
 
@@ -124,8 +131,8 @@ class Progress(Protocol):
         """Replace the live line; ``done`` is the finished share in [0, 1], None where it is unknown."""
         ...
 
-    def note(self, message: str) -> None:
-        """Print a line that stays: a decision and its reason, or a warning."""
+    def note(self, code: str, text: str) -> None:
+        """Print a :class:`Note`."""
         ...
 
 

@@ -38,12 +38,14 @@ class SilentProgress:
     def __init__(self) -> None:
         self.updates: list[tuple[str, float | None]] = []
         self.notes: list[str] = []
+        self.codes: list[str] = []  # of the notes
 
     def update(self, message: str, done: float | None = None) -> None:
         self.updates.append((message, done))
 
-    def note(self, message: str) -> None:
-        self.notes.append(message)
+    def note(self, code: str, text: str) -> None:
+        self.notes.append(text)
+        self.codes.append(code)
 
 
 @pytest.fixture(autouse=True)

@@ -1,13 +1,13 @@
-"""Errors that a user can act on, told by their codes: how they are worded is no matter of the tests that raise them."""
+"""Errors and notes told by their codes: how they are worded is no matter of the tests that meet them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import pytest
 
 from pipeline.engine.failures import StageFailed
-from stages.contract import StageError
+from stages.contract import Note, StageError
 
 
 def error_of(caught: pytest.ExceptionInfo[Any]) -> StageError:
@@ -26,3 +26,17 @@ def refused(code: str, *values: object) -> Iterator[pytest.ExceptionInfo[Any]]:
     assert error.code == code, str(error)
     said = f"{error.what}\n{error.why}\n{error.hint}"
     assert [value for value in values if str(value) not in said] == [], said
+
+
+def codes(notes: Iterable[Note]) -> list[str]:
+    """Of each note its code."""
+    return [note.code for note in notes]
+
+
+def no_note(code: str, text: str) -> None:
+    """A ``note`` of a test in which there is nothing to say."""
+    pytest.fail(f"{code}: {text}")
+
+
+def unheard(code: str, text: str) -> None:
+    """A ``note`` of a test that is about other things."""

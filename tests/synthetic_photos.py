@@ -40,5 +40,5 @@ class Quiet:
     def update(self, message: str, done: float | None = None) -> None:
         pass
 
-    def note(self, message: str) -> None:
+    def note(self, code: str, text: str) -> None:
         pass

@@ -1,4 +1,4 @@
-"""Every error that a user can act on has a code of its own, which begins with its stage or package."""
+"""Every error that a user can act on, and every note, has a code of its own, which begins with its stage or package."""
 
 import re
 from collections import Counter
@@ -28,7 +28,7 @@ def test_codes_name_the_package_they_come_from() -> None:
 
 def test_a_code_is_used_once() -> None:
     used = Counter(code_of(call, module) for module in OURS for call in made(module.tree))
-    assert len(used) > 110
+    assert len(used) > 220
     assert [code for code, times in used.items() if times > 1] == []
 
 
@@ -50,6 +50,8 @@ def test_wrong_codes_are_found() -> None:
     for code in ('"no-overlap"', '"train.no-overlap"', '"sfm.No overlap"', "why"):
         assert len(offenders(wrong_codes, [module("stages/sfm/a.py", f"StageError({code}, '', '', '')")])) == 1
     assert offenders(wrong_codes, [module("stages/sfm/a.py", "StageError('sfm.no-overlap', '', '', '')")]) == []
+    for note in ("progress.note('moved', text)", "notes.append(Note('train.moved', text))", "note(f'{x}', text)"):
+        assert len(offenders(wrong_codes, [module("stages/sfm/a.py", note)])) == 1, note
 
 
 def test_another_code_or_value_is_no_refusal() -> None:

@@ -1,8 +1,8 @@
 """How errors and notes are worded, in one snapshot a stage: ``python -m tests.wording`` writes them from the source.
 
 A snapshot is tests/stages/<stage>/messages.txt, or tests/pipeline/messages.txt: each code with what happened, why, and
-what to try; then the notes of each module. A value that the program fills in stands there in braces as the source names
-it; where one of several sentences is chosen, each has a line.
+what to try, or what a note says. A value that the program fills in stands there in braces as the source names it; where
+one of several sentences is chosen, each has a line.
 """
 
 import ast
@@ -15,8 +15,8 @@ SNAPSHOT = "messages.txt"
 
 
 def makers(modules: list[Module]) -> dict[str, ast.FunctionDef | None]:
-    """What makes an error, StageError and the functions that are given its code, with how they are defined."""
-    found: dict[str, ast.FunctionDef | None] = {"StageError": None}
+    """What makes an error or a note, and the functions that are given its code, with how they are defined."""
+    found: dict[str, ast.FunctionDef | None] = {"StageError": None, "Note": None}
     for node in (node for module in modules for node in ast.walk(module.tree)):
         if isinstance(node, ast.FunctionDef) and node.args.args and node.args.args[0].arg == "code":
             found[node.name] = node
@@ -33,12 +33,14 @@ def package_of(module: Module) -> str:
 
 
 def made(tree: ast.AST) -> Iterator[ast.Call]:
-    """Calls that make an error with a code of its own."""
+    """Calls that make an error or a note with a code of its own."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in MAKERS and node.args:
-            code = ast.unparse(node.args[0])
-            if code not in ("code", "error.code"):
-                yield node
+        if not (isinstance(node, ast.Call) and node.args and not isinstance(node.args[0], ast.Starred)):
+            continue
+        makes = isinstance(node.func, ast.Name) and node.func.id in MAKERS
+        notes = (isinstance(node.func, ast.Attribute) and node.func.attr == "note") or ast.unparse(node.func) == "note"
+        if (makes or notes) and ast.unparse(node.args[0]) not in ("code", "error.code"):
+            yield node
 
 
 def assigned(tree: ast.AST, own: bool = False) -> dict[str, list[ast.expr]]:
@@ -80,7 +82,7 @@ def code_of(call: ast.Call, module: Module) -> str:
 
 
 def wording(module: Module) -> Iterator[tuple[str, list[str]]]:
-    """Each code of a module with how it is worded, and its path with its notes."""
+    """Each code of a module with how it is worded."""
     constants = assigned(module.tree, own=True)
     scopes = [node for node in ast.walk(module.tree) if isinstance(node, ast.FunctionDef)]
 
@@ -91,13 +93,6 @@ def wording(module: Module) -> Iterator[tuple[str, list[str]]]:
 
     for call in made(module.tree):
         yield code_of(call, module), texts(call, call.args[1:])
-    notes = [node for node in ast.walk(module.tree) if isinstance(node, ast.Call) and _is_note(node)]
-    if said := [text for call in notes for text in texts(call, call.args)]:
-        yield module.name, said
-
-
-def _is_note(call: ast.Call) -> bool:
-    return isinstance(call.func, ast.Attribute) and call.func.attr == "note"
 
 
 def snapshots() -> dict[str, str]:

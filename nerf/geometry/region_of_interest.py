@@ -19,7 +19,7 @@ from nerf.geometry.reconstruction import (
     within,
 )
 
-CaptureType = Literal["around", "inside", "forward"]
+CaptureType = Literal["object-centric", "inside-out", "forward-facing"]
 
 FORWARD_DEG = 30.0  # four fifths of the optical axes within this of their median: all photos face one way
 CONVERGENT_DEG = 30.0  # four fifths of the axes within this of the direction to their common focus: they look at it
@@ -54,8 +54,8 @@ def find_capture_type(scene: Reconstruction) -> CaptureType:
     middle = spatial_median(scene.axes)
     length = np.linalg.norm(middle)
     if length > 0 and np.quantile(angles_deg(scene.axes, middle / length), 0.8) <= FORWARD_DEG:
-        return "forward"
-    return "around" if look_at_point(scene.centres, scene.axes, focus(scene)) else "inside"
+        return "forward-facing"
+    return "object-centric" if look_at_point(scene.centres, scene.axes, focus(scene)) else "inside-out"
 
 
 def look_at_point(
@@ -71,10 +71,10 @@ def look_at_point(
 def find_region(scene: Reconstruction, capture_type: CaptureType) -> Region:
     """The cube, aligned with the axes of the frame ``scene`` is in.
 
-    around: centred on the focus, holding 95 % of the observed points but not reaching beyond the cameras;
-    forward: the photos' frusta between the nearest and farthest observed depths; inside: the observed points and the
-    cameras, up to twice the usual viewing distance. Photos with alpha show nothing but the object: it is
-    held whole.
+    Object-centric: centred on the focus, holding 95 % of the observed points but not reaching beyond the cameras.
+    Forward-facing: the photos' frusta between the nearest and farthest observed depths. Inside-out: the observed points
+    and the cameras, up to twice the usual viewing distance. Photos with alpha show nothing but the object: it is held
+    whole.
     Raises ValueError when the cameras stand in one place and there are no points to give a scale.
     """
     cube = _ungrown(scene, capture_type)
@@ -95,9 +95,11 @@ def beyond_alpha(scene: Reconstruction, capture_type: CaptureType, given: Region
 
 
 def _ungrown(scene: Reconstruction, capture_type: CaptureType) -> Region:
-    if capture_type == "around" and scene.opaque is not None:
+    if capture_type == "object-centric" and scene.opaque is not None:
         return _carved(scene, scene.opaque)
-    return {"around": _around, "forward": _forward, "inside": _inside}[capture_type](scene)
+    return {"object-centric": _object_centric, "forward-facing": _forward_facing, "inside-out": _inside_out}[
+        capture_type
+    ](scene)
 
 
 def share_beyond(scene: Reconstruction, centre: Float[np.ndarray, "3"], half: float) -> float:
@@ -128,7 +130,7 @@ def _near_by(scene: Reconstruction) -> Bool[np.ndarray, "n"]:
     return distance <= FAR_CAMERA * np.median(distance)
 
 
-def _around(scene: Reconstruction) -> Region:
+def _object_centric(scene: Reconstruction) -> Region:
     centre = focus(scene)
     distance = float(np.median(np.linalg.norm(scene.centres - centre, axis=1)))
     width = distance * float(np.median(_half_widths(scene)))
@@ -164,7 +166,7 @@ def _half_widths(scene: Reconstruction) -> Float[np.ndarray, "n"]:
     return np.minimum(sideways.max(-1), 1.0)
 
 
-def _forward(scene: Reconstruction) -> Region:
+def _forward_facing(scene: Reconstruction) -> Region:
     near, far = _depth_extent(scene)
     near_by = _near_by(scene)
     ends = np.concatenate([scene.centres[:, None] + depth * scene.rays for depth in (near, far)], axis=1)
@@ -185,7 +187,7 @@ def _depth_extent(scene: Reconstruction) -> tuple[float, float]:
     return depth / 2, depth * 2
 
 
-def _inside(scene: Reconstruction) -> Region:
+def _inside_out(scene: Reconstruction) -> Region:
     middle = spatial_median(scene.centres)
     spread = np.linalg.norm(scene.centres - middle, axis=1)
     centres = scene.centres[_near_by(scene)]

@@ -73,8 +73,8 @@ class Scene:
     """Everything that training and rendering need to know of the geometry.
 
     ``bounded``: all that the photos show lies inside the region of interest; otherwise space beyond it is contracted
-    (nerf/geometry/contraction.py). ``has_alpha``: the photos' alpha says what is background. ``capture_type``: the
-    cameras stand around an object, look outward or through a room, or all face forward.
+    (nerf/geometry/contraction.py). ``has_alpha``: the photos' alpha says what is background. ``capture_type``:
+    cameras around an object, cameras that look outward or through a room, or all facing one way.
     """
 
     cameras: tuple[Camera, ...]
@@ -82,7 +82,7 @@ class Scene:
     scene_from_sfm: Similarity
     bounded: bool
     has_alpha: bool
-    capture_type: Literal["around", "inside", "forward"]
+    capture_type: Literal["object-centric", "inside-out", "forward-facing"]
     up_known: bool
 
     def of_split(self, split: Split) -> tuple[View, ...]:

@@ -94,7 +94,7 @@ def run_command(words: Sequence[str]) -> int:
         if debug:
             traceback.print_exc()
         what = f"a defect of this program, not of your photos: {type(error).__name__}: {error}"
-        _say("pipeline.defect", what, "it should not happen", REPORT_IT, as_json)
+        _say("pipeline.defect", what, "this should never happen", REPORT_IT, as_json)
         return exit_codes.DEFECT
 
 
@@ -131,7 +131,7 @@ def command_run(words: Sequence[str]) -> int:
     """``pipeline run PHOTOS``: the whole chain, or a part of it."""
     given = arguments.parse(arguments.RunArguments, "run", words)
     if given.more is not None and given.config is not None:
-        what = f"--more goes on with the recorded options, not with those of --config {given.config}"
+        what = f"--more uses the recorded options, not those of --config {given.config}"
         raise UsageError(f"{what}; leave --config out, and give what is to change as flags")
     file = {} if given.config is None else read_toml(given.config)
     if given.config is not None:  # the file's values become the defaults that flags override
@@ -382,7 +382,7 @@ def command_demo(words: Sequence[str]) -> int:
         display.begin("truth")
         *notes, last = demo.truth_lines(root / "output", photos)
         for text in notes:
-            display.note(text)
+            display.note("pipeline.truth", text)
         display.end("truth", last, time.monotonic() - started, cached=False)
         report = root / "output" / "report.html"
         display.finished(f"→ the report: {report}", {"report.html": report})

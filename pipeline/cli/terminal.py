@@ -92,8 +92,8 @@ class PlainDisplay:
             share = "" if done is None else f" {100 * done:.0f} %"
             self._say(f"{self._stage:<10} …{share} {message}")
 
-    def note(self, message: str) -> None:
-        self._say(f"{self._stage:<10} {message}")
+    def note(self, code: str, text: str) -> None:
+        self._say(f"{self._stage:<10} {text}")
 
     def end(self, stage: str, line: str, seconds: float, cached: bool) -> None:
         self._say(end_line(stage, line, seconds, cached))
@@ -129,8 +129,8 @@ class JsonDisplay:
             self._last = now
             self._event("progress", stage=self._stage, message=message, done=done)
 
-    def note(self, message: str) -> None:
-        self._event("note", stage=self._stage, message=message)
+    def note(self, code: str, text: str) -> None:
+        self._event("note", stage=self._stage, code=code, message=text)
 
     def end(self, stage: str, line: str, seconds: float, cached: bool) -> None:
         self._event("end", stage=stage, line=line, seconds=round(seconds, 3), cached=cached)
@@ -180,8 +180,8 @@ class RichDisplay:
             total, completed = (None, 0.0) if done is None else (1.0, done)
             self.progress.update(self._task, description=escape(message), total=total, completed=completed)
 
-    def note(self, message: str) -> None:
-        self._print(f"{self._stage:<10} {message}", style="yellow")
+    def note(self, code: str, text: str) -> None:
+        self._print(f"{self._stage:<10} {text}", style="yellow")
 
     def _clear(self) -> None:
         if self._task is not None:

@@ -16,7 +16,7 @@ class Display(Protocol):
 
     def update(self, message: str, done: float | None = None) -> None: ...
 
-    def note(self, message: str) -> None: ...
+    def note(self, code: str, text: str) -> None: ...
 
     def end(self, stage: str, line: str, seconds: float, cached: bool) -> None: ...
 
@@ -37,7 +37,7 @@ class SilentDisplay:
     def update(self, message: str, done: float | None = None) -> None:
         pass
 
-    def note(self, message: str) -> None:
+    def note(self, code: str, text: str) -> None:
         pass
 
     def end(self, stage: str, line: str, seconds: float, cached: bool) -> None:

@@ -27,7 +27,7 @@ def worded(stage: str) -> Iterator[None]:
         if not _is_out_of_memory(error):
             raise
         hint = "Close other programs, or lower the resolution or batch settings of this stage."
-        why = str(error).splitlines()[0] if str(error) else f"{stage} asked for more than there is"
+        why = str(error).splitlines()[0] if str(error) else f"{stage} needs more memory than there is"
         raise StageFailed(stage, StageError("pipeline.out-of-memory", "out of memory", why, hint)) from error
 
 

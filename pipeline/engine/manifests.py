@@ -26,7 +26,7 @@ class BadManifest(Exception):
 @dataclass(frozen=True)
 class Manifest:
     """One finished stage. ``outputs`` and ``records`` map relative paths to {"size", "sha256"}; ``expected`` are the
-    seconds that were foretold, None where nobody could tell or a budget gave them."""
+    expected seconds, None if they could not be estimated or a budget set them."""
 
     stage: str
     version: int

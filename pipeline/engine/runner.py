@@ -236,12 +236,12 @@ class Runner:
             except BadManifest as problem:
                 damaged = damaged or needed
                 if needed:
-                    self.display.note(f"quarantined as .bad and rebuilt: {problem}")
+                    self.display.note("pipeline.quarantined-input", f"quarantined as .bad and rebuilt: {problem}")
                 else:
                     del folders[name]
                     command = command_that_makes(name, self.run_file.stages, self.workspace.root)
                     rebuild = f"`{command} --verify` rebuilds it ({problem})"
-                    self.display.note(f"{name} is damaged: left out; {rebuild}")
+                    self.display.note("pipeline.damaged-input", f"{name} is damaged: left out; {rebuild}")
         if damaged:
             raise DamagedInputs
 
@@ -362,7 +362,7 @@ class Runner:
         what_is_left = {stage: None, **to_come}
         main = (how := declared(module, "FLEXIBLE")) is not None and how.max_share >= 1
         if main and (why := self.budget.shortage(STAGES, what_is_left, reading)):
-            self.display.note(f"the budget cannot be kept: {why}")
+            self.display.note("pipeline.budget-exceeded", f"the budget cannot be kept: {why}")
         return options.model_copy(update={"seconds": self.budget.give(STAGES, stage, to_come, reading)})
 
     def _config_for_key(self, stage: str, config: StageConfig) -> dict[str, Any]:
@@ -392,7 +392,7 @@ class Runner:
                 self.checked.add(job.stage)
             return manifest
         except BadManifest as problem:
-            self.display.note(f"quarantined as .bad and rebuilt: {problem}")
+            self.display.note("pipeline.quarantined", f"quarantined as .bad and rebuilt: {problem}")
             return None
 
     def _execute(self, job: Job) -> Manifest:

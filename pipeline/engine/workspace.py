@@ -60,7 +60,7 @@ class Workspace:
             why = "there is no run.json in it" if root.is_dir() else "there is no such folder"
             hint = "Start one with: pipeline run PHOTOS"
             if photo_set(root).name and root.exists() and ((named := default_workspace(root)) / RUN_FILE).is_file():
-                hint = f"The workspace that is called after it is {named.name}."
+                hint = f"The workspace with its name is {named.name}."
             raise StageError("pipeline.no-workspace", f"{root} is not a workspace", why, hint)
         _refuse_links(root)
         return cls(root)
@@ -269,8 +269,8 @@ class Workspace:
             if shown.exists() and not self._is_ours(shown):
                 raise StageError(
                     "pipeline.not-a-result",
-                    f"{shown} is none of this program's results",
-                    "one of that name is to be shown there, and what is there would be lost",
+                    f"{shown} was not made by this program",
+                    "a result of the same name would replace it",
                     "Move it elsewhere, or give another folder with -o.",
                 )
 

@@ -104,7 +104,10 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     more = (config.seconds - pilots * took) / (fitting - took)
     if pilots < MAX_PILOTS:
         count = "none" if not pilots else "one at most"
-        progress.note(f"a pilot takes about {duration(took)} here, {duration(config.seconds)} are given: {count}")
+        progress.note(
+            "effects.few-pilots",
+            f"a pilot takes about {duration(took)} here, {duration(config.seconds)} are given: {count}",
+        )
     return config.model_copy(update={"pilots": pilots, "fitting_pilots": min(pilots, int(more))})
 
 

@@ -40,8 +40,9 @@ def affordable_fraction(config: "Config", inputs: Inputs, progress: Progress) ->
     fraction = _rounded_down(time_budget.seconds_left() / whole, (renders + PREVIEW_SHARE) / renders)
     if fraction < 1:
         progress.note(
+            "evaluate.some-pixels",
             f"{short_count(speed)} rays/s here: all pixels of {len(test)} test photos take about {duration(whole)}, "
-            f"{time_budget.message()}; --evaluate.fraction 1 asks for all"
+            f"{time_budget.message()}; --evaluate.fraction 1 asks for all",
         )
     return fraction
 

@@ -84,7 +84,7 @@ def score(scorer: "Scorer", folder: Path, progress: Progress) -> Scores:
     notes = []
     if masked := len(test) - len(views):
         notes.append(f"masks leave nothing to compare of {photos_in_words(masked)} at this size")
-        progress.note(notes[-1])
+        progress.note("evaluate.masked", notes[-1])
     if not views:
         return Scores([], notes)
     progress.update("averaging the training photos")

@@ -18,7 +18,9 @@ def chosen_backend(device: str, progress: Progress | None = None) -> BackendName
     """ "warp" if its kernels run on ``device`` ("cpu" or "cuda"), else "torch"; then the reason is said."""
     why = why_not_warp(device)
     if why and progress:
-        progress.note(f"the hash-grid field is computed by torch alone, several times slower: {why}")
+        progress.note(
+            "hardware.torch-alone", f"the hash-grid field is computed by torch alone, several times slower: {why}"
+        )
     return "torch" if why else "warp"
 
 
@@ -29,7 +31,8 @@ def backend_of_field(trained_with: BackendName, device: str, progress: Progress 
         return chosen_backend(device, progress)
     if progress:
         progress.note(
-            "the hash-grid field is computed by torch alone, as it was trained: several times slower than by Warp"
+            "hardware.trained-without-warp",
+            "the hash-grid field is computed by torch alone, as it was trained: several times slower than by Warp",
         )
     return "torch"
 

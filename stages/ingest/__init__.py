@@ -64,7 +64,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         photos = conversion.store(converted, folder)
         write_photos(folder, photos, converted.rejected, source.frames)
         if converted.notes:
-            write_json(folder / NOTES, converted.notes)
+            write_json(folder / NOTES, [note.text for note in converted.notes])
     conversion.note_findings(photos, converted, progress)
     has_masks, has_alpha = (any(parts) for parts in zip(*((p.mask, p.has_alpha) for p in photos), strict=True))
     return StageResult(

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from stages.contract import Progress, StageError
+from stages.contract import Note, Progress, StageError
 from stages.hardware.device import processors
 from stages.hardware.memory import at_once, check_memory
 from stages.ingest import messages
@@ -101,7 +101,7 @@ class Converted(NamedTuple):
     taken: list[_Taken]
     rejected: list[Rejection]
     duplicate_of: dict[str, str]
-    notes: list[str]
+    notes: list[Note]
 
 
 def convert(source: Source, max_frames: int, folder: Path, progress: Progress) -> Converted:
@@ -116,7 +116,7 @@ def convert(source: Source, max_frames: int, folder: Path, progress: Progress) -
         notes += messages.excluded_by_values(sorted(deep))
         taken, duplicates = _without_duplicates(taken)
         rejected = sorted(rejected + duplicates, key=lambda rejection: rejection.name)
-    notes += [f"{shown(t.name)}: {note}" for t in taken for note in t.notes]
+    notes += [Note("ingest.assumed", f"{shown(t.name)}: {assumed}") for t in taken for assumed in t.notes]
     notes += messages.nearly_black([photo.brightest for photo in taken])
     try:
         duplicate_of = _checked(source, taken, rejected, progress)
@@ -149,13 +149,16 @@ def writing(folder: Path) -> Iterator[None]:
 
 def _take_all(
     source: Source, max_frames: int, waiting: Path, progress: Progress
-) -> tuple[list[_Taken], list[Rejection], list[str]]:
+) -> tuple[list[_Taken], list[Rejection], list[Note]]:
     """What is taken, what is rejected, and notes on masks that belong to no photo."""
     if source.kind == "video":
         return _take_video(source.files[0], max_frames, waiting, progress), [], []
     masks, strays = pair_masks([source.name(file) for file in source.files], source.masks)
     notes = messages.excluded(source.excluded)
-    notes += [f"{shown(f'masks/{file.name}')} is no photo's mask, which are called NAME.png" for file in strays]
+    notes += [
+        Note("ingest.stray-mask", f"{shown(f'masks/{file.name}')} is no photo's mask, which are called NAME.png")
+        for file in strays
+    ]
     stored = are_of_stored_pixels((file, masks[name]) for file in source.files if (name := source.name(file)) in masks)
     outcomes = _decode_all(source, masks, bool(stored), waiting, progress)
     taken = [outcome for outcome in outcomes if isinstance(outcome, _Taken)]
@@ -309,7 +312,7 @@ def _near_duplicates(taken: Sequence[_Taken], progress: Progress) -> dict[str, s
         raise messages.all_the_same(len(taken))
     same, brackets = well_exposed(same, [photo.exposure for photo in taken], pixels)
     if brackets:
-        progress.note(messages.bracketed(brackets))
+        progress.note("ingest.brackets", messages.bracketed(brackets))
     return {taken[index].name: taken[kept].name for index, kept in sorted(same.items())}
 
 

@@ -66,7 +66,7 @@ def list_photos(root: Path) -> tuple[Path, ...]:
         raise StageError(
             "ingest.broken-links",
             f"no photos in {root}",
-            f"{lost} of its files are links to what is not there",
+            f"{lost} of its files are broken links",
             _LINKS_HINT,
         )
     if not photos and len(videos) != 1:
@@ -130,7 +130,7 @@ def _no_photos(root: Path, found: list[Path], videos: list[Path]) -> StageError:
     if videos:
         names = ", ".join(video.relative_to(root).as_posix() for video in videos[:5])
         return StageError("ingest.several-videos", 
-            f"{len(videos)} videos in {root}", f"{names}: which one is meant is not clear",
+            f"{len(videos)} videos in {root}", f"{names}: it is not clear which one to use",
             f"Give one of them: pipeline run {videos[0]}",
         )  # fmt: skip
     suffixes = ", ".join(sorted({file.suffix.lower() or file.name for file in found})[:5])

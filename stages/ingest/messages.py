@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from stages.contract import Progress, StageError, listed
+from stages.contract import Note, Progress, StageError, listed
 from stages.ingest.auxiliary_files import instant_ngp_masks, is_mask
 from stages.ingest.masks import STILL_BACKGROUND_HINT
 from stages.ingest.near_duplicates import Brackets
@@ -23,30 +23,32 @@ def shown(name: str) -> str:
     return name if name.isprintable() else repr(name)
 
 
-def note_first(notes: Sequence[str], where: str, progress: Progress) -> None:
+def note_first(notes: Sequence[Note], where: str, progress: Progress) -> None:
     """Note the first few, how many more there are, and the file that has all of them."""
     for note in notes[:MAX_NOTES]:
-        progress.note(note)
+        progress.note(*note)
     if len(notes) > MAX_NOTES:
-        progress.note(f"… and {len(notes) - MAX_NOTES} more, all in {where}")
+        progress.note("ingest.more-notes", f"… and {len(notes) - MAX_NOTES} more, all in {where}")
 
 
 def note_rejected(rejected: Sequence[Rejection], progress: Progress) -> None:
     """Note which files are no photos, and why."""
     note_first(
-        [f"rejected {shown(rejection.name)}: {rejection.reason}" for rejection in rejected], "photos.json", progress
+        [Note("ingest.rejected", f"rejected {shown(one.name)}: {one.reason}") for one in rejected],
+        "photos.json",
+        progress,
     )
 
 
-def note_everything(rejected: Sequence[Rejection], notes: Sequence[str], progress: Progress) -> None:
+def note_everything(rejected: Sequence[Rejection], notes: Sequence[Note], progress: Progress) -> None:
     """Every rejected file, by reason, and every note, where no file will be left to look them up in."""
     by_reason: dict[str, list[str]] = {}
     for rejection in rejected:
         by_reason.setdefault(rejection.reason, []).append(shown(rejection.name))
     for reason, names in by_reason.items():
-        progress.note(f"rejected {', '.join(names)}: {reason}")
+        progress.note("ingest.rejected-photos", f"rejected {', '.join(names)}: {reason}")
     for note in notes:
-        progress.note(note)
+        progress.note(*note)
 
 
 def note_unused(source: Source, photos: Path, progress: Progress) -> None:
@@ -55,38 +57,50 @@ def note_unused(source: Source, photos: Path, progress: Progress) -> None:
         folder = shown(str(photos))
         lie, them = ("1 photo lies", "is") if beside == 1 else (f"{beside} photos lie", "are")
         how = f"to use all, move them into images/; to use only them, move images/ out of {folder}"
-        progress.note(f"{lie} in {folder} beside images/ and {them} not used: {how}")
+        progress.note("ingest.photos-beside-images", f"{lie} in {folder} beside images/ and {them} not used: {how}")
     if (cameras := unused_cameras(source)) is not None:
         place, option = shown(str(cameras)), shown(f"--cameras {shlex.quote(str(cameras))}")
-        progress.note(f"cameras lie in {place} and are not used: {option} would use them")
+        progress.note("ingest.unused-cameras", f"cameras lie in {place} and are not used: {option} would use them")
     if (masks := unused_masks(source)) is not None:
         lie, wanted = shown(str(masks)), shown(str(source.root / "masks"))
-        progress.note(f"masks lie in {lie} and are not used: in {wanted} they would be (black is ignored)")
+        progress.note(
+            "ingest.unused-masks", f"masks lie in {lie} and are not used: in {wanted} they would be (black is ignored)"
+        )
 
 
-def excluded(files: Mapping[str, str]) -> list[str]:
+def excluded(files: Mapping[str, str]) -> list[Note]:
     """Notes on files that are not taken for photos, {file: the photo that it belongs to}."""
     used = instant_ngp_masks(files).values()
-    notes = [f"{len(used)} masks of instant-ngp's ({shown(min(used))}, …) are used: white is ignored"] if used else []
+    notes = list[Note]()
+    if used:
+        words = f"{len(used)} masks of instant-ngp's ({shown(min(used))}, …) are used: white is ignored"
+        notes.append(Note("ingest.instant-ngp-masks", words))
     files = {name: photo for name, photo in files.items() if name not in used}
     if not files:
         return notes
     named = [f"{shown(name)} (of {shown(photo)})" for name, photo in sorted(files.items())]
     count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
-    notes += [f"{count} excluded, named as a mask, depth map or other copy of a photo: {listed(named, 3)}"]
+    words = f"{count} excluded, named as a mask, depth map or other copy of a photo: {listed(named, 3)}"
+    notes.append(Note("ingest.excluded", words))
     if mask := next((name for name in sorted(files) if is_mask(name)), None):
         place = f"masks/{os.path.splitext(files[mask])[0]}.png"
-        notes.append(f"to be used as a mask, whose black is ignored, {shown(mask)} would have to be {shown(place)}")
+        notes.append(
+            Note(
+                "ingest.mask-elsewhere",
+                f"to be used as a mask, whose black is ignored, {shown(mask)} would have to be {shown(place)}",
+            )
+        )
     return notes
 
 
-def excluded_by_values(files: Sequence[str]) -> list[str]:
+def excluded_by_values(files: Sequence[str]) -> list[Note]:
     """A note on files among colour photos whose values are those of depth maps."""
     if not files:
         return []
     count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
     named = listed([shown(name) for name in files], 3)
-    return [f"{count} excluded as depth maps, being grey of 16 bits or of floats among photos in colour: {named}"]
+    words = f"{count} excluded as depth maps, being grey of 16 bits or of floats among photos in colour: {named}"
+    return [Note("ingest.depth-maps", words)]
 
 
 def bracketed(brackets: Brackets) -> str:
@@ -98,13 +112,13 @@ def bracketed(brackets: Brackets) -> str:
     return f"{each}: the {which} of each is kept, where least is clipped or too dark"
 
 
-def nearly_black(brightest: Sequence[int]) -> list[str]:
+def nearly_black(brightest: Sequence[int]) -> list[Note]:
     """A note where no photo is brighter than its values make it that have 12 bits or fewer in files of 16;
     ``brightest`` has the largest of each photo, of 255."""
     if (most := max(brightest, default=255)) > NEARLY_BLACK:
         return []
     how = "if their values are of 10 or 12 bits in files of 16, scale them up first, those of 12 by 16"
-    return [f"all photos are nearly black, at most {most} of 255: {how}"]
+    return [Note("ingest.nearly-black", f"all photos are nearly black, at most {most} of 255: {how}")]
 
 
 def note_findings(photos: Sequence[Photo], progress: Progress) -> None:
@@ -112,7 +126,9 @@ def note_findings(photos: Sequence[Photo], progress: Progress) -> None:
     same = [f"{shown(p.name)} (as {shown(p.near_duplicate_of)})" for p in photos if p.near_duplicate_of]
     if same:
         are = _photos_are(len(same))
-        progress.note(f"{are} nearly the same picture as another and left out of matching: {_few(same)}")
+        progress.note(
+            "ingest.near-duplicates", f"{are} nearly the same picture as another and left out of matching: {_few(same)}"
+        )
     blurred = [
         f"{shown(p.name)} ({p.relative_sharpness:.2f} ×)"
         for p in photos
@@ -120,7 +136,7 @@ def note_findings(photos: Sequence[Photo], progress: Progress) -> None:
     ]
     if blurred:
         are = _photos_are(len(blurred))
-        progress.note(f"{are} far less sharp than those before and after, and kept: {_few(blurred)}")
+        progress.note("ingest.blurred", f"{are} far less sharp than those before and after, and kept: {_few(blurred)}")
 
 
 def note_masks(ignored: Sequence[float], turned: int, resized: int, photos: int, progress: Progress) -> None:
@@ -130,15 +146,19 @@ def note_masks(ignored: Sequence[float], turned: int, resized: int, photos: int,
     turned_words = f", {turned} turned upright like the photo" if turned else ""
     resized_words = f", {resized} made as large as the photo" if resized else ""
     share = sum(ignored) / len(ignored)
-    progress.note(f"masks of {len(ignored)} of {photos} photos ignore {share:.0%} of them{turned_words}{resized_words}")
+    progress.note(
+        "ingest.masks",
+        f"masks of {len(ignored)} of {photos} photos ignore {share:.0%} of them{turned_words}{resized_words}",
+    )
 
 
-def taken_as_upright(names: Sequence[str]) -> list[str]:
+def taken_as_upright(names: Sequence[str]) -> list[Note]:
     """A note on photos that EXIF turned and whose masks fit them turned or not."""
     if not names:
         return []
     which = f"masks of {len(names)} photos fit upright and as stored alike (EXIF orientation)"
-    return [f"{which}, and are taken as upright: look at masks/ of {_few([shown(name) for name in names])}"]
+    words = f"{which}, and are taken as upright: look at masks/ of {_few([shown(name) for name in names])}"
+    return [Note("ingest.ambiguous-masks", words)]
 
 
 def _photos_are(count: int) -> str:
@@ -192,7 +212,7 @@ def all_plain(colours: Sequence[tuple[str, str]]) -> StageError:
     """The error for photos that show nothing: (name, the one colour of all its pixels)."""
     name, colour = colours[0]
     why = f"{shown(name)} is {colour} everywhere, so there is nothing that could be found or learnt"
-    hint = "Look at the photos: a cap on the lens, an exposure far off, or an export that failed."
+    hint = "Look at the photos: a cap on the lens, a wrong exposure, or a failed export."
     return StageError("ingest.plain-photos", f"all {len(colours)} photos show one single colour", why, hint)
 
 

@@ -340,7 +340,7 @@ def _colmap_model(folder: Path, photos: Sequence[str]) -> Path:
         raise StageError(
             "ingest.several-colmap-models",
             f"{len(models)} COLMAP models in {folder}",
-            f"cameras of the {len(photos)} photos are in {each}: which one is meant is not clear",
+            f"cameras of the {len(photos)} photos are in {each}: it is not clear which one to use",
             f"Give the one with most: --cameras {best}",
         )
     return models[0]

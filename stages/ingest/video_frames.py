@@ -87,8 +87,9 @@ def take_frames(video: Path, most: int, folder: Path, progress: Progress) -> lis
         raise _no_way(video, frames)
     way = frames[-1].path
     progress.note(
+        "ingest.frames-taken",
         f"{len(chosen)} of {len(frames)} frames taken: the sharpest of each step of about "
-        f"{way / (len(chosen) - 1):.0%} of the picture's width, {way:.1f} widths in all"
+        f"{way / (len(chosen) - 1):.0%} of the picture's width, {way:.1f} widths in all",
     )
     return list(_write(video, frames, chosen, transfer, folder, progress))
 
@@ -150,7 +151,10 @@ def _measure(video: Path, progress: Progress) -> list[Frame]:
     if not frames:
         raise _undecodable("ingest.no-frame-decodes", video, "not one frame of it can be decoded")
     if lacks_frames(len(frames), announced):
-        progress.note(f"only {len(frames)} of {announced} frames of {video.name} can be decoded: is the file whole?")
+        progress.note(
+            "ingest.frames-missing",
+            f"only {len(frames)} of {announced} frames of {video.name} can be decoded: is the file whole?",
+        )
     return frames
 
 
@@ -252,12 +256,13 @@ def _usable_transfer(video: Path, progress: Progress) -> str | None:
         return None
     what = f"{video.name} is HDR video ({HDR_TRANSFERS[transfer]})"
     if can_tone_map():
-        progress.note(f"{what}: its frames are tone-mapped to sRGB, white at {WHITE_NITS} cd/m²")
+        progress.note("ingest.tone-mapped", f"{what}: its frames are tone-mapped to sRGB, white at {WHITE_NITS} cd/m²")
         return transfer
     source, filters = shell_quoted(video.name), f'-vf "{tone_mapping(transfer)},format=yuv420p"'
     progress.note(
+        "ingest.no-tone-mapping",
         f"{what}, and this ffmpeg has no filters zscale and tonemap: its frames look flat. Convert it first by one "
-        f"that has them: ffmpeg -i {source} {filters} -c:v libx264 -crf 12 sdr.mp4"
+        f"that has them: ffmpeg -i {source} {filters} -c:v libx264 -crf 12 sdr.mp4",
     )
     return None
 

@@ -109,7 +109,10 @@ class PixelStore:
         fits = len(mapped) <= FITS * free
         if not fits:
             sizes = f"{bytes_in_words(len(mapped))} at this size, {bytes_in_words(free)} of memory are free"
-            progress.note(f"the photos take {sizes}: training waits for the disk; a larger --train.downscale will not")
+            progress.note(
+                "io.photos-exceed-memory",
+                f"the photos take {sizes}: training waits for the disk; a larger --train.downscale will not",
+            )
         if hasattr(mapped, "madvise"):  # not on Windows
             mapped.madvise(mmap.MADV_WILLNEED if fits else mmap.MADV_RANDOM)
         with warnings.catch_warnings():
@@ -154,7 +157,10 @@ def _is_sound(store: PixelStore, progress: Progress) -> bool:
         return False
     if not (damaged := store.damaged()):
         return True
-    progress.note(f"the pixels of {damaged[0]} in {store.path.name} have changed on the disk: making it again")
+    progress.note(
+        "io.pixels-changed",
+        f"the pixels of {damaged[0]} in {store.path.name} have changed on the disk: making it again",
+    )
     store.path.unlink()
     return False
 
@@ -177,7 +183,7 @@ def _only_one(store: PixelStore, progress: Progress) -> Iterator[None]:
 def _write(store: PixelStore, load: Load, workers: int, progress: Progress) -> None:
     if store.path.exists():
         found = f"{store.path.stat().st_size:,} bytes and not {store.size:,}"
-        progress.note(f"the pixel store {store.path.name} has {found}: making it again")
+        progress.note("io.pixel-store-rebuilt", f"the pixel store {store.path.name} has {found}: making it again")
     partial, photos, written = store.path.with_name(f"{store.path.name}.partial"), len(store.photos), 0
 
     def describe() -> tuple[str, float]:

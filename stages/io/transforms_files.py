@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from stages.contract import StageError
+from stages.contract import Note, StageError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,7 +54,7 @@ def _check_frames(frames: list[Any], what: str) -> None:
 
 def read_splits(
     cameras: Path, has_photo: Callable[[dict[str, Any]], bool]
-) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
+) -> tuple[list[tuple[str, dict[str, Any]]], list[Note]]:
     """All frames of a transforms file or of a Blender-style folder: (where they stand, content of such a file), those
     held out last, with all of them as ``test_filenames``; and notes.
 
@@ -75,20 +75,27 @@ def read_splits(
     for where, other in held_out:
         own = [frame for frame in other["frames"] if not _is_copy(frame, trained_on)]
         if repeated := len(other["frames"]) - len(own):
-            notes.append(f"{where} repeats {repeated} frames of {train}: they stay photos to train on")
+            notes.append(
+                Note(
+                    "io.tests-repeat-training",
+                    f"{where} repeats {repeated} frames of {train}: they stay photos to train on",
+                )
+            )
         if own and not any(map(has_photo, own)):
             notes.append(none_among_the_photos(len(own), where))
         elif own:
             if where == HELD_OUT[1]:
-                notes.append(f"the test photos are those of {where}: {HELD_OUT[0]} gives none")
+                notes.append(
+                    Note("io.tests-from-validation", f"the test photos are those of {where}: {HELD_OUT[0]} gives none")
+                )
             names = [frame["file_path"] for frame in own]
             return [(train, content), (where, other | {"frames": own, "test_filenames": names})], notes
     return [(train, content)], notes
 
 
-def none_among_the_photos(count: int, where: str) -> str:
+def none_among_the_photos(count: int, where: str) -> Note:
     """The note on test photos that are not there, or that ingest rejected."""
-    return f"none of the {count} test photos of {where} is among the photos"
+    return Note("io.no-test-photos", f"none of the {count} test photos of {where} is among the photos")
 
 
 def _is_copy(frame: dict[str, Any], trained_on: Mapping[PurePosixPath, Any]) -> bool:

@@ -52,7 +52,7 @@ def clean(
     if not inside.any():
         why = f"none of its {len(surface.faces)} faces lies in {min_views} photos between near and far"
         raise StageError(
-            "mesh.nothing-covered", "no part of the surface lies in the photos", why, "Try --mesh.keep all."
+            "mesh.nothing-covered", "no part of the surface lies within the photos' frusta", why, "Try --mesh.keep all."
         )
     surface, old = keep_faces(surface, inside)
     hidden = 0

@@ -112,7 +112,7 @@ def _iso_level(
     if config.iso_level is not None:
         return IsoLevel(config.iso_level, "given", None, True)
     chosen = choose_iso_level(grid, model, sample_rays(maps, ISO_LEVEL_RAYS))
-    progress.note(f"surface at density {chosen.density:.3g}: {chosen.reason}")
+    progress.note("mesh.iso-level", f"surface at density {chosen.density:.3g}: {chosen.reason}")
     return chosen
 
 

@@ -53,7 +53,7 @@ def check_range(grid: DensityGrid, iso_level: float | None) -> None:
             "mesh.density-not-finite",
             "the density is not finite",
             f"{broken} of {grid.values.numel()} grid points are NaN or infinite",
-            "Train again: the field is broken.",
+            "Train again: the field has diverged.",
         )
     low, high = float(grid.values.min()), float(grid.values.max())
     opacity = 1 - float(torch.exp(-high * (grid.high - grid.low).norm()))
@@ -65,7 +65,7 @@ def check_range(grid: DensityGrid, iso_level: float | None) -> None:
         raise StageError("mesh.uniform-field", "the field has no surface", why, RETRAIN)
     if iso_level is not None and not low < iso_level < high:
         why = f"density runs from {low:.3g} to {high:.3g} per scene unit"
-        hint = "Give --mesh.iso-level a value in between, or leave it out to have one chosen."
+        hint = "Give --mesh.iso-level a value in between, or leave it out for the default."
         raise StageError("mesh.level-out-of-range", f"no surface at density {iso_level:g}", why, hint)
 
 

@@ -36,13 +36,13 @@ def viewpoints(vertices: np.ndarray, scene: Scene) -> tuple[Viewpoint, Viewpoint
     """
     poses = np.stack([view.scene_from_camera for view in scene.of_split("train")])
     centres = poses[:, :, 3]
-    if scene.capture_type == "around":
+    if scene.capture_type == "object-centric":
         towards = -poses[:, :, 2]
         side = towards[np.abs(towards[:, 2] - np.sin(np.radians(ELEVATION))).argmin()]
         return _framed(vertices, side, UP), _framed(vertices, _opposite(side, towards), UP)
     first = int(np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmin())
     second = int(np.linalg.norm(centres - centres[first], axis=1).argmax())
-    if scene.capture_type == "inside":
+    if scene.capture_type == "inside-out":
         focal_px = WIDTH / 2 / np.tan(np.radians(ROOM_FIELD_OF_VIEW) / 2)
         return Viewpoint(poses[first], focal_px, WIDTH, HEIGHT), Viewpoint(poses[second], focal_px, WIDTH, HEIGHT)
     one, other = levelled(poses[[first, second]])

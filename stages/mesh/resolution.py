@@ -76,7 +76,7 @@ def grid_box(capture_type: CaptureType, points: np.ndarray) -> np.ndarray:
     """
     cube = np.array([[-REGION_HALF_SIZE] * 3, [REGION_HALF_SIZE] * 3])
     points = points[(np.abs(points) <= REGION_HALF_SIZE).all(axis=1)]
-    if capture_type == "around" or len(points) < MIN_POINTS:
+    if capture_type == "object-centric" or len(points) < MIN_POINTS:
         return cube
     low, high = np.quantile(points, [QUANTILE, 1 - QUANTILE], axis=0)
     flat, side = int((high - low).argmin()), 2 * REGION_HALF_SIZE

@@ -7,7 +7,7 @@ from pydantic import Field
 from stages.contract import Inputs, Progress, StageConfig, StageResult, Workload
 
 INPUTS = ("ingest", "sfm")
-VERSION = 16
+VERSION = 17
 EXIT_CODE = 12
 RESUMES = False
 PUBLISHED = ("transforms.json", "scene.json")

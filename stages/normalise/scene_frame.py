@@ -63,8 +63,9 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
     if has_alpha and not found.bounded:
         where = "what the photos' alpha leaves" if config.roi is None else "the region given"
         progress.note(
+            "normalise.alpha-beyond-region",
             f"{found.beyond_alpha:.1%} of what is tracked lies beyond {where}: the scene goes on there, and "
-            "transparent parts are ignored, as masked ones are"
+            "transparent parts are ignored, as masked ones are",
         )
     scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split)
     write_json(folder / "scene.json", scene.to_json())
@@ -72,7 +73,10 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
     write_json(folder / "transforms.json", transforms(scene))
     if (without := sum(view.mask is None for view in scene.views)) and any(photo.mask for photo in photos):
         them = f"{without} of {len(scene.views)} photos have none"
-        progress.note(f"transforms.json names no masks: nerfstudio takes one for each photo or none, and {them}")
+        progress.note(
+            "normalise.no-masks-exported",
+            f"transforms.json names no masks: nerfstudio takes one for each photo or none, and {them}",
+        )
     return StageResult(
         outputs=("scene.json", "points.safetensors", "transforms.json"),
         line=_line(found),
@@ -106,10 +110,16 @@ def _has_alpha(photos: list[Photo], progress: Progress, tracked: bool) -> bool:
     opaque = len(photos) - transparent
     has_alpha = transparent > opaque and 2 * framing > transparent
     if has_alpha and opaque:
-        progress.note(f"{opaque} of {len(photos)} photos have no transparent parts: taken as opaque everywhere")
+        progress.note(
+            "normalise.opaque-photos",
+            f"{opaque} of {len(photos)} photos have no transparent parts: taken as opaque everywhere",
+        )
     elif transparent and not has_alpha:
         why = "most photos have none" if transparent <= opaque else "what is opaque is seen whole in few"
-        progress.note(f"transparent parts of {transparent} of {len(photos)} photos are ignored like masked ones: {why}")
+        progress.note(
+            "normalise.alpha-ignored",
+            f"transparent parts of {transparent} of {len(photos)} photos are ignored like masked ones: {why}",
+        )
     return has_alpha
 
 
@@ -210,9 +220,9 @@ def _line(found: Normalisation) -> str:
     """What was decided, for the user."""
     arc = 360 if found.arc_deg > FULL_TURN_DEG else round(found.arc_deg / 10) * 10
     capture_type = {
-        "around": f"{arc}° around an object",
-        "inside": "inside a space, looking around",
-        "forward": "photos facing one way",
+        "object-centric": f"{arc}° around an object",
+        "inside-out": "inside-out capture of a space",
+        "forward-facing": "forward-facing capture",
     }[found.capture_type]
     background = "transparent" if found.bounded else "unbounded"
     up = f"up from {found.up.source}" if found.up.known else "no up: the cameras disagree"

@@ -73,9 +73,9 @@ def default_path(scene: Scene) -> PathKind:
     def is_clear(path: np.ndarray) -> bool:
         return camera_paths.keeps_clear(path, poses, near)
 
-    if scene.capture_type == "around" and scene.up_known and is_clear(camera_paths.orbit(poses, TRIAL_FRAMES)):
+    if scene.capture_type == "object-centric" and scene.up_known and is_clear(camera_paths.orbit(poses, TRIAL_FRAMES)):
         return "orbit"
-    spiral = scene.capture_type == "forward" and camera_paths.suits_spiral(poses)
+    spiral = scene.capture_type == "forward-facing" and camera_paths.suits_spiral(poses)
     if spiral and is_clear(camera_paths.spiral(poses, TRIAL_FRAMES)):
         return "spiral"
     return "interpolated"
@@ -85,7 +85,7 @@ def _poses(scene: Scene) -> np.ndarray:
     """Of the training photos, (n, 3, 4); levelled in a forward-facing capture: photos held sideways would tilt the
     path."""
     poses = np.stack([view.scene_from_camera for view in scene.of_split("train")])
-    return levelled(poses) if scene.capture_type == "forward" else poses
+    return levelled(poses) if scene.capture_type == "forward-facing" else poses
 
 
 def make_path(scene: Scene, kind: PathKind, frames: int) -> CameraPath:

@@ -69,7 +69,7 @@ def _choose_frames_and_width(
     rendered = measured_speed(train, lambda side: _timed_rays(path, scene, side), int(longest))
     speed = 1 / (1 / rendered + WRITING_SECONDS)
     frames, width = choose_frames_and_width(time_budget.seconds_left() * speed, camera, longest, *given)
-    progress.note(_choice_message(path.resized(width), frames, speed, time_budget, given))
+    progress.note("render.size", _choice_message(path.resized(width), frames, speed, time_budget, given))
     return frames, width
 
 
@@ -204,18 +204,23 @@ def with_appearance(
     if photo is None:
         return renderer, description
     if renderer.model is renderer.field:
-        progress.note(f"the field has no exposure model: all photos, and so {photo}, count as exposed alike")
+        progress.note(
+            "render.no-exposure", f"the field has no exposure model: all photos, and so {photo}, count as exposed alike"
+        )
         return renderer, description
     view = next((view for view in scene.views if view.name == photo), None)
     if view is None:
         similar = difflib.get_close_matches(photo, [view.name for view in scene.views], n=3)
         suggestion = f"; did you mean {' or '.join(similar)}?" if similar else ""
-        progress.note(f"there is no registered photo {photo}: {description}{suggestion}")
+        progress.note("render.no-such-photo", f"there is no registered photo {photo}: {description}{suggestion}")
         return renderer, description
     as_photo = renderer.through(new_view_like(photo_effects(field, scene, view, renderer.device)))
     if any(photo in rows for rows in field["effects"].values()):
         return as_photo, f"exposed like {photo}"
-    progress.note(f"{photo} is no training photo: its exposure is estimated from the training photos nearest to it")
+    progress.note(
+        "render.expected-exposure",
+        f"{photo} is no training photo: its exposure is estimated from the training photos nearest to it",
+    )
     return as_photo, f"exposed as estimated for {photo}"
 
 

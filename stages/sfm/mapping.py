@@ -5,6 +5,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from stages.contract import Note
 from stages.sfm import global_mapping
 from stages.sfm.colmap.diagnosis import compare_models, disagree
 from stages.sfm.colmap.mapping import incremental_options, map_globally, map_incrementally
@@ -101,11 +102,21 @@ def _checked(model: Any, other: Any, database: Path, matches: Path, options: Any
         if other is not None and (best[1].failed() or disagree(model, other)):
             best = better(best, (other, check_model(other, database, state.job.seed)))
             if best[0] is other:
-                state.send(note="verified matches agree better with global than with incremental mapping: it is taken")
+                state.send(
+                    note=Note(
+                        "sfm.global-mapping",
+                        "verified matches agree better with global than with incremental mapping: it is taken",
+                    )
+                )
         if failed := best[1].failed():
             misplaced = best[1].check.misplaced.any()
             what = "contradict their verified matches" if misplaced else "are not linked to the others"
-            state.send(note=f"{len(failed)} of {len(best[1].ids)} registered photos {what}: registering them again")
+            state.send(
+                note=Note(
+                    "sfm.registered-again",
+                    f"{len(failed)} of {len(best[1].ids)} registered photos {what}: registering them again",
+                )
+            )
             again = register_again(*best, matches, state.images, Path(state.job.folder, "again"), options)
             best = max(best, (again, check_model(again, database, state.job.seed)), key=_passing)
     model, checked = best

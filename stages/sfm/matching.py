@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from stages.amounts import rough_duration
+from stages.contract import Note
 from stages.ingest.masks import write_feature_masks
 from stages.sfm.colmap.database import (
     RELAXED_RATIO,
@@ -120,7 +121,9 @@ def _match_all(database: Path, state: JobState) -> dict[str, Any] | None:
             break
     verified = int((verified_matches(database, pairs) >= MIN_INLIERS).sum())
     helped = "consecutive photos by name or time are among them" if informative else "their order tells nothing"
-    state.send(note=f"{verified:,} of {len(pairs):,} tried pairs of photos verified; {helped}")
+    state.send(
+        note=Note("sfm.verified-pairs", f"{verified:,} of {len(pairs):,} tried pairs of photos verified; {helped}")
+    )
     return {"tried": len(pairs), "verified": verified, "order": bool(informative)}
 
 
@@ -143,7 +146,9 @@ def consecutive_pairs(state: JobState) -> set[tuple[int, int]]:
 def _match(database: Path, pairs: Pairs, max_ratio: float, state: JobState) -> None:
     def expect(left: int, seconds: float) -> None:
         if state.job.matcher == "exhaustive":
-            state.send(note=f"matching {left:,} pairs of photos: about {rough_duration(seconds)}")
+            state.send(
+                note=Note("sfm.matching-time", f"matching {left:,} pairs of photos: about {rough_duration(seconds)}")
+            )
 
     expected = expected_pairs(state.job.matcher, len(state.photos), state.job.neighbours)
     state.begin("matching", database=str(database), pairs=max(len(pairs), expected))

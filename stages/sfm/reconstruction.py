@@ -103,7 +103,9 @@ def _reconstruct(
     matches, conflict = read_matches(Path(found["database"])), found["conflict"]
     images = image_rows(names, matches, models, found["observations"], found["supports"], conflict, found["left_out"])
     if conflict:
-        progress.note(repeated_structure(conflict, {photo.image_name: photo.name for photo in photos}))
+        progress.note(
+            "sfm.repeated-structure", repeated_structure(conflict, {photo.image_name: photo.name for photo in photos})
+        )
     _note_unregistered(photos, images, progress)
     _note_weak_links(photos, found["check"]["weak_links"], progress)
     registration = _registration(
@@ -150,9 +152,7 @@ def _check_camera(config: "Config", photos: Sequence[Photo]) -> None:
     what = "cannot use --sfm.camera-params"
     hint = "Give COLMAP's numbers for these photos: --sfm.camera-model SIMPLE_RADIAL --sfm.camera-params F CX CY K."
     if config.camera_model is None:
-        raise StageError(
-            "sfm.parameters-without-model", what, "the model that they are the parameters of is not given", hint
-        )
+        raise StageError("sfm.parameters-without-model", what, "they need --sfm.camera-model", hint)
     sizes = sorted({(photo.width, photo.height) for photo in photos})
     if len(sizes) > 1:
         listed = ", ".join(f"{width}×{height}" for width, height in sizes[:3])
@@ -184,9 +184,9 @@ def _database(folder: Path, names: Sequence[str], progress: Progress) -> Path:
         return database
     if _are_sound(folder / "strategies") and all(is_sound(one, names) for one in folder.glob("matches-*.db")):
         features, pairs = count_done(database)
-        progress.note(f"resuming with the features of {features} photos and {pairs} matched pairs")
+        progress.note("sfm.resumes", f"resuming with the features of {features} photos and {pairs} matched pairs")
     else:
-        progress.note("the matches of the interrupted run are damaged: starting over")
+        progress.note("sfm.damaged-matches", "the matches of the interrupted run are damaged: starting over")
         _remove_intermediate(folder)
     return database
 
@@ -235,10 +235,12 @@ def _georeference(folder: Path, photos: Sequence[Photo], progress: Progress) -> 
     centres = np.array([image.sfm_from_camera[:, 3] for image in located])
     found = georeference(centres, [position_of[image.file] for image in located])
     if isinstance(found, str):
-        progress.note(f"no metres from the photos' GPS: {found}")
+        progress.note("sfm.no-gps-scale", f"the photos' GPS gives no metric scale: {found}")
         return None
     scale = f"one unit is {found.enu_from_sfm.scale:.3g} m"
-    progress.note(f"GPS of {found.used} photos: {scale}; positions are off by {found.error_m:.1f} m (median)")
+    progress.note(
+        "sfm.gps-scale", f"GPS of {found.used} photos: {scale}; positions are off by {found.error_m:.1f} m (median)"
+    )
     return found.to_json()
 
 
@@ -246,19 +248,21 @@ def _note_unregistered(photos: Sequence[Photo], images: list[dict[str, Any]], pr
     missing = [(photo.name, i["reason"]) for photo, i in zip(photos, images, strict=True) if not i["registered"]]
     if not missing:
         return
-    progress.note(f"{len(missing)} of {len(photos)} photos could not be registered and are left out:")
+    progress.note(
+        "sfm.unregistered", f"{len(missing)} of {len(photos)} photos could not be registered and are left out:"
+    )
     by_reason: dict[str, list[str]] = {}
     for name, reason in missing:
         by_reason.setdefault(reason, []).append(name)
     for reason, who in by_reason.items():
-        progress.note(f"  {listed(who, MAX_NAMES)}: {reason}")
+        progress.note("sfm.unregistered-reason", f"  {listed(who, MAX_NAMES)}: {reason}")
 
 
 def _note_weak_links(photos: Sequence[Photo], links: Sequence[dict[str, Any]], progress: Progress) -> None:
     """Name the photos whose poses rest on few matches: nothing else would show it if these were wrong."""
     weak = {file for link in links for file in link["photos"]}
     if who := [photo.name for photo in photos if photo.image_name in weak]:
-        progress.note(f"few matches hold the poses of {listed(who, MAX_NAMES)} beside the others")
+        progress.note("sfm.few-matches", f"few matches hold the poses of {listed(who, MAX_NAMES)} beside the others")
 
 
 def _skipped_for_time(strategies: Sequence[dict[str, Any]]) -> str:

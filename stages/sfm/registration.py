@@ -230,7 +230,8 @@ def why_no_model(photos: Sequence[Photo], matches: Matches, registered: int, poi
         return error
     why = f"{verified} of {pairs} pairs of photos share a view, but none of them shows the depth of the scene"
     if registered:
-        why = f"only {registered} photos and {points} points fit together; {verified} of {pairs} pairs share a view"
+        found = f"only {registered} photos and {points} points were reconstructed"
+        why = f"{found}; {verified} of {pairs} pairs share a view"
     return StageError("sfm.no-model", what, why, OVERLAP_HINT)
 
 
@@ -259,6 +260,6 @@ def _no_depth(what: str, photos: Sequence[Photo], matches: Matches) -> StageErro
             "sfm.planar-scene",
             what,
             f"planar scene: one plane explains {planar} of {count} matching pairs",
-            "Take in something that stands out from the surface, and photograph it from the side as well.",
+            "Include something that stands out from the surface, and photograph it from the side as well.",
         )
     return None

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from stages.amounts import rough_duration
+from stages.contract import Note
 from stages.io.files import make_durable
 from stages.sfm.colmap.diagnosis import find_conflict, links, supports
 from stages.sfm.colmap.final_bundle_adjustment import final_bundle_adjustment
@@ -136,10 +137,10 @@ def _try_strategies(state: JobState) -> None:
             why = f"{len(missing)} of {len(state.photos)} photos {are} not registered yet"
             if _is_misfit(state):
                 why = "the cameras do not fit the verified matches"
-            state.send(note=f"{why}: {strategy.description}")
+            state.send(note=Note("sfm.strategy", f"{why}: {strategy.description}"))
             _try(strategy, missing, state)
     for why, descriptions in unsaid.items():
-        state.send(note=f"skipped, because {why}: {'; '.join(descriptions)}")
+        state.send(note=Note("sfm.strategy-useless", f"skipped, because {why}: {'; '.join(descriptions)}"))
 
 
 def _why_useless(strategy: Strategy, missing: list[int], state: JobState) -> str | None:
@@ -168,7 +169,9 @@ def _sequence_broken(state: JobState) -> bool:
 def _why_infeasible(strategy: Strategy, missing: list[int], state: JobState) -> str | None:
     """Why the strategy might help and is skipped all the same, which is said; None if it is tried."""
     if became := state.log.abandoned.get(strategy.name):
-        state.send(note=f"skipped, because it {became} last time: {strategy.description}")
+        state.send(
+            note=Note("sfm.strategy-failed-before", f"skipped, because it {became} last time: {strategy.description}")
+        )
         return f"it {became}"
     outcomes, (left, limit), chosen_pairs = state.log.outcomes, state.left(), state.job.matcher != "exhaustive"
     expected = expected_seconds(strategy, outcomes, len(missing) / len(state.photos), chosen_pairs)
@@ -176,7 +179,7 @@ def _why_infeasible(strategy: Strategy, missing: list[int], state: JobState) -> 
         return None
     rest = f"of {limit} {rough_duration(max(0.0, left))} are left"
     times = f"about {rough_duration(expected)} and the final bundle adjustment, {rest}"
-    state.send(note=f"skipped, because it would take {times}: {strategy.description}")
+    state.send(note=Note("sfm.strategy-too-slow", f"skipped, because it would take {times}: {strategy.description}"))
     return f"{NO_TIME} {limit}"
 
 

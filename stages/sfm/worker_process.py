@@ -56,7 +56,7 @@ def run_worker(
                 _hand_over(child.stdin, job)
                 for message in map(json.loads, child.stdout):
                     if note := message.pop("note", None):
-                        progress.note(note)
+                        progress.note(*note)
                     begins = message.get("phase", latest["phase"]) != latest["phase"]
                     latest.update(message)
                     if begins:  # a phase may take less than the live line waits
@@ -148,7 +148,7 @@ def _worker_failed(code: int, limit: float | None, phase: str, last: str, withou
     if limit is not None:
         return StageError(
             "sfm.timeout",
-            f"structure-from-motion was given up {where}",
+            f"structure from motion was stopped {where}",
             f"it took longer than {limit:g} s",
             without or "Give it longer with --sfm.max-seconds, or fewer photos; matches found so far are kept.",
         )
@@ -157,10 +157,10 @@ def _worker_failed(code: int, limit: float | None, phase: str, last: str, withou
         memory = code == -signal.SIGKILL
         return StageError(
             "sfm.worker-killed",
-            f"structure-from-motion was ended by {name} {where}",
-            "most often the machine ran out of memory" if memory else f"COLMAP failed inside ({last})",
+            f"structure from motion was killed by {name} {where}",
+            "most often the machine ran out of memory" if memory else f"COLMAP crashed ({last})",
             without or f"Run again: what was matched is kept. With less memory: --sfm.max-features 2048. Log: {log}",
         )
     return StageError(
-        "sfm.worker-failed", f"structure-from-motion failed {where}", last, without or f"The whole log is in {log}"
+        "sfm.worker-failed", f"structure from motion failed {where}", last, without or f"The whole log is in {log}"
     )

@@ -347,7 +347,7 @@ class _NoNotes:
     def __init__(self, progress: Progress) -> None:
         self.update = progress.update
 
-    def note(self, message: str) -> None:
+    def note(self, code: str, text: str) -> None:
         """Nothing."""
 
 

@@ -98,9 +98,9 @@ def plan_study(config: "Config", inputs: Inputs, progress: Progress) -> "Config"
 def _scene_with_test_photos(inputs: Inputs) -> Scene:
     scene = read_scene(inputs["normalise"])
     if not scene.of_split("test"):
-        why = "no photo of this scene was kept for testing"
+        why = "this scene has no test photos"
         hint = "Lower --normalise.test-every, or add photos."
-        raise StageError("tradeoff.no-test-photos", "nothing to score a study by", why, hint)
+        raise StageError("tradeoff.no-test-photos", "nothing to score the study on", why, hint)
     return scene
 
 
@@ -151,7 +151,7 @@ def run_study(config: "Config", inputs: Inputs, folder: Path, progress: Progress
     assert config.tiles and config.sizes, "plan() chooses them"
     scene, schedule, runs = _scene_with_test_photos(inputs), schedule_of(config), folder / "runs"
     for line in schedule_lines(schedule, config.seconds, runs):
-        progress.note(line)
+        progress.note("tradeoff.schedule", line)
     with counting(folder / "clock.json") as spent:
         benchmark = make_benchmark(inputs["ingest"], scene, config.downscale, config.tiles, config.sizes[-1])
         results, late = list[Result](), list[Run]()
@@ -166,16 +166,16 @@ def run_study(config: "Config", inputs: Inputs, folder: Path, progress: Progress
             inner = _RunProgress(progress, f"{place} {run.variant}", spent() / config.seconds)
             results.append(Result(run, train_and_score(run, benchmark, inputs, runs, inner)))
             slowness = sum(r.figures["wall_seconds"] for r in results) / sum(r.run.seconds for r in results)
-            progress.note(f"{place} {_result_line(results[-1])}")
+            progress.note("tradeoff.result", f"{place} {_result_line(results[-1])}")
         if late:
             why = "this machine is slower than when it was measured" if slowness > 1 else "no time is left"
-            progress.note(f"{why}; not trained: {'; '.join(list_runs(late))}")
+            progress.note("tradeoff.not-trained", f"{why}; not trained: {'; '.join(list_runs(late))}")
         existing = score_workspace_field(benchmark, inputs, runs, config.seconds, progress)
     failed = [f"{run.label} ({figures['failed']})" for run, figures in results if figures["failed"]]
     if len(failed) == len(results):
         why = "; ".join(dict.fromkeys(str(figures["failed"]) for _, figures in results))
         why = why or f"{duration(config.seconds)} are too short here even for {schedule.left_out[0]}"
-        raise StageError("tradeoff.no-result", "the study has no result", why, "Give it more time, as in --budget 30m.")
+        raise StageError("tradeoff.no-result", "the study has no result", why, "Give it more time, e.g. --budget 30m.")
     return Outcome(results, (*schedule.left_out, *list_runs(late), *failed), existing, benchmark)
 
 
@@ -199,9 +199,9 @@ class _RunProgress:
         del done
         self.progress.update(f"{self.name} · {message}", self.done)
 
-    def note(self, message: str) -> None:
+    def note(self, code: str, text: str) -> None:
         """As a live line."""
-        self.update(message)
+        self.update(text)
 
 
 # --- save

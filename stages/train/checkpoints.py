@@ -44,7 +44,7 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 
 def latest_checkpoint(
     folder: Path,
-    note: Callable[[str], None],
+    note: Callable[[str, str], None],
     fits: Callable[[Checkpoint], None] = lambda _: None,
     remove: bool = True,
 ) -> Checkpoint | None:
@@ -65,7 +65,7 @@ def latest_checkpoint(
             problem = f"holds a failed field ({error})"
         except (RuntimeError, TypeError) as error:
             problem = f"belongs to another training ({' '.join(str(error).split())})"
-        note(f"the checkpoint of step {step} {problem}; using the one before")
+        note("train.checkpoint-skipped", f"the checkpoint of step {step} {problem}; using the one before")
         if remove:
             (folder / f"{step:09d}.json").unlink()
             (folder / f"{step:09d}.safetensors").unlink(missing_ok=True)

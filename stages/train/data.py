@@ -129,7 +129,10 @@ def _masked(dataset: RayDataset, ignored: "Iterable[Tensor | None]", split: "Spl
     except ValueError as error:
         why = f"{error} of the {split} photos at this size"
         raise StageError(ALL_MASKED, "nothing is left to train on", why, "Give a smaller --train.downscale.") from error
-    progress.note(f"masks leave {dataset.unmasked_count / len(dataset.pixels):.0%} of the pixels of the {split} photos")
+    progress.note(
+        "train.masked",
+        f"masks leave {dataset.unmasked_count / len(dataset.pixels):.0%} of the pixels of the {split} photos",
+    )
     return dataset
 
 

@@ -95,7 +95,7 @@ class TrainingRun:
         else:
             self._resume(checkpoint)
         if message := lost_time_message(self.lost):
-            progress.note(message)
+            progress.note("train.lost-time", message)
 
     def train(self) -> None:
         """Train to the end of the budget. Raises StageError if the field diverges, or collapses with every seed."""
@@ -152,10 +152,12 @@ class TrainingRun:
         self._write_schedule()
         self._save()
         self.log.event("extended", step, total_steps=self.schedule.total_steps)
-        self.progress.note(f"continuing the finished training from step {step:,} to step {self.schedule.total_steps:,}")
+        self.progress.note(
+            "train.more", f"continuing the finished training from step {step:,} to step {self.schedule.total_steps:,}"
+        )
         target = self.evaluation_sets.target
         if target is not None and self.state.pending_target(target.psnr) is None:
-            self.progress.note(target_already_reached_message(target.psnr))
+            self.progress.note("train.target-reached-before", target_already_reached_message(target.psnr))
 
     def _budget_limits(self) -> tuple[int | None, float | None]:
         """The steps or seconds after which the run ends at the latest, including those of earlier runs and without the
@@ -181,7 +183,7 @@ class TrainingRun:
             self._write_schedule()
         self._schedule_checkpoint()
         self.log.event("resumed", self.state.step)
-        self.progress.note(resumed_message(self.state.step, self.schedule.total_steps, left))
+        self.progress.note("train.resumes", resumed_message(self.state.step, self.schedule.total_steps, left))
 
     def _load(self, checkpoint: Checkpoint, schedule_file: Path) -> None:
         self.state = RunState(**checkpoint.facts)
@@ -295,7 +297,7 @@ class TrainingRun:
             self._write_schedule()
             self.log.event("target-revision", step, total_steps=schedule.total_steps)
             if schedule.total_steps > step:
-                self.progress.note(target_revision_message(self.state, target.psnr, schedule))
+                self.progress.note("train.target-revision", target_revision_message(self.state, target.psnr, schedule))
 
     def _max_steps(self) -> int:
         """How many steps the budget allows for."""
@@ -336,7 +338,10 @@ class TrainingRun:
         elif reason := self._failure_reason():
             self.state.failure_reason = reason
             self.log.event("undertrained", self.state.step, reason=reason)
-            self.progress.note(f"after {self.state.step:,} steps the field is undertrained: {reason}; train longer")
+            self.progress.note(
+                "train.undertrained",
+                f"after {self.state.step:,} steps the field is undertrained: {reason}; train longer",
+            )
 
     def _check_health_fully(self) -> None:
         if reason := self._failure_reason():
@@ -360,7 +365,9 @@ class TrainingRun:
             self.state.step, self.state.rollbacks = checkpoint.step, rollbacks
             self.state.curve = [point for point in self.state.curve if point["step"] <= checkpoint.step]
             self._schedule_evaluation()
-        self.progress.note(f"{failure}: back to step {self.state.step:,} at half the learning rate")
+        self.progress.note(
+            "train.rolled-back", f"{failure}: back to step {self.state.step:,} at half the learning rate"
+        )
 
     def _load_healthy(self, checkpoint: Checkpoint) -> None:
         """Restore it. Raises TrainingFailure if its field had collapsed: the batch PSNR shows that only seconds
@@ -393,7 +400,8 @@ class TrainingRun:
             hint = "Check the cameras: the photos may not fit their poses. Or try a tenth of --train.learning-rate."
             raise StageError("train.collapsed", "the field does not learn", why, hint)
         self.progress.note(
-            f"after {MIN_HEALTHY_STEPS} steps the field has collapsed: {reason}; restarting with another seed"
+            "train.restarted",
+            f"after {MIN_HEALTHY_STEPS} steps the field has collapsed: {reason}; restarting with another seed",
         )
         shutil.rmtree(self.checkpoints)
         self._start(self.state.restarted(restarts, rollbacks=0))

@@ -44,7 +44,7 @@ def planned(config: Config, inputs: Inputs, progress: Progress) -> Config:
         whole = continued(config, inputs)
         open_size = config.downscale is None  # what the user gave is what they want
         if open_size and (words := larger_photos_words(whole, inputs, scene, _used_shares(inputs["ingest"], scene))):
-            progress.note(words)
+            progress.note("train.larger-photos", words)
         return whole
     preset = config.preset or "standard"
     seconds = SECONDS[preset] if config.steps is None and config.seconds is None else config.seconds
@@ -53,7 +53,7 @@ def planned(config: Config, inputs: Inputs, progress: Progress) -> Config:
     if config.space is None:
         space, why = chosen_space(decisions, scene)
         config = config.filled({"space": space})
-        progress.note(f"space {why}")
+        progress.note("train.space", f"space {why}")
     field = field_of(config)
     config = field.prepared(field.with_defaults(config), progress)
     if config.matmul is None:
@@ -62,7 +62,7 @@ def planned(config: Config, inputs: Inputs, progress: Progress) -> Config:
         return config
     progress.update("trying how fast this machine trains")
     rays = rays_in_budget(config, scene, decisions)
-    progress.note(reason(config, rays))
+    progress.note("train.photo-size", reason(config, rays))
     if config.downscale is None:
         used = _used_shares(inputs["ingest"], scene)
         config = config.filled({"downscale": chosen_downscale(scene, rays, used, progress)})
@@ -151,8 +151,9 @@ def chosen_downscale(
     least = math.ceil(10 * math.sqrt(table / max(1.0, MAX_MEMORY_SHARE * free))) / 10
     if least > wanted and progress:
         progress.note(
+            "train.memory-limits-photos",
             f"photos at 1/{least:g} of their size: at 1/{wanted:g}, which the budget could make use of, their pixels "
-            f"take {bytes_in_words(table / wanted**2)}, and of the GPU's memory {bytes_in_words(free)} are free"
+            f"take {bytes_in_words(table / wanted**2)}, and of the GPU's memory {bytes_in_words(free)} are free",
         )
     return max(wanted, least)
 

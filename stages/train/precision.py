@@ -23,8 +23,9 @@ def chosen_precision(config: Config, progress: Progress) -> Precision:
     if not medium.is_worthwhile:
         return "highest"
     progress.note(
+        "train.matmul-medium",
         f"matrix products at torch's precision medium: {medium.speedup:.1f} times faster here, "
-        f"off by {medium.error:.0e}"
+        f"off by {medium.error:.0e}",
     )
     return "medium"
 
@@ -32,7 +33,10 @@ def chosen_precision(config: Config, progress: Progress) -> Precision:
 def say_if_inexact(config: Config, progress: Progress) -> None:
     """Where a precision that was asked for, or chosen on another machine, means less here."""
     if config.matmul == "medium" and not (medium := _medium(config)).is_exact:
-        progress.note(f"matrix products are off by {medium.error:.0e} here; --train.matmul highest computes exact ones")
+        progress.note(
+            "train.matmul-inexact",
+            f"matrix products are off by {medium.error:.0e} here; --train.matmul highest computes exact ones",
+        )
 
 
 def precision_facts(config: Config) -> dict[str, Any]:

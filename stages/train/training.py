@@ -67,8 +67,9 @@ def _with_validation_photos(target_psnr: float, scene: Scene, progress: Progress
     scene = with_validation_split(scene)
     validation, left = len(scene.of_split("validation")), len(scene.of_split("train"))
     progress.note(
+        "train.validation-photos",
         f"{validation} of {validation + left} training photos become validation photos, "
-        f"to tell when {target_psnr:g} dB are reached"
+        f"to tell when {target_psnr:g} dB are reached",
     )
     return scene
 
@@ -114,9 +115,9 @@ def _note_sizes(config: Config, budget: TrainingBudget, dataset: RayDataset, pro
     photos = f"{len(dataset.near)} photos at 1/{config.downscale:g} of their size"
     field = field_of(config)
     sizes = f"{config.field} field ({field.sizes_in_words(config)})"
-    progress.note(f"{sizes}, {another}{amount} · {photos}, {short_count(len(dataset.pixels))} pixels")
+    progress.note("train.sizes", f"{sizes}, {another}{amount} · {photos}, {short_count(len(dataset.pixels))} pixels")
     if message := field.step_in_words(config):
-        progress.note(message)
+        progress.note("train.step", message)
 
 
 def compute(training: Training) -> None:
@@ -138,7 +139,7 @@ def save(training: Training, folder: Path, progress: Progress) -> StageResult:
     with use_matmul_precision(config.matmul):
         profile = write_profile(folder, run.state.timings, config, run.evaluation_sets.train.colours.device)
     for message in _closing_notes(training):
-        progress.note(message)
+        progress.note("train.outlook", message)
     batches = sorted(path.name for path in folder.glob("nonfinite_*.safetensors"))
     tensorboard = ["tensorboard"] if config.tensorboard else []
     final = checkpoint_files(run.checkpoints, run.state.step)

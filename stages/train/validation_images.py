@@ -68,7 +68,7 @@ def held_out_evaluation(
     except StageError as error:
         if split != "test" or error.code != ALL_MASKED:
             raise
-        progress.note(f"test photos are not measured while training: {error.why}")
+        progress.note("train.no-test-photos", f"test photos are not measured while training: {error.why}")
         return None
     background = torch.tensor(field_background(config, scene))
     return HeldOutEvaluation(

@@ -47,8 +47,8 @@ def found(
         def update(self, message: str, done: float | None = None) -> None:
             pass
 
-        def note(self, message: str) -> None:
-            notes.append(message)
+        def note(self, code: str, text: str) -> None:
+            notes.append(text)
 
     shoot(folder / "photos", shots, develop)
     inputs = {"ingest": folder / "ingest"}

@@ -89,7 +89,7 @@ def scene() -> Any:
         for i, pose in enumerate(ring_of_cameras(4))
     )
     camera = Camera("PINHOLE", W, H, (30.0, 31.0, 12.0, 10.0))
-    return Scene((camera,), views, Similarity(0.5, np.eye(3), np.zeros(3)), False, False, "around", True)
+    return Scene((camera,), views, Similarity(0.5, np.eye(3), np.zeros(3)), False, False, "object-centric", True)
 
 
 def try_path(folder: Path) -> None:

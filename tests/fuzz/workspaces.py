@@ -28,6 +28,7 @@ from stages.io.photos import read_frame_names, read_photos, write_photos
 from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from tests.fuzz.cameras import photos_of
 from tests.fuzz.inputs import json_files, one_of
+from tests.refusals import unheard
 
 TOML = b"""[train]
 steps = 500
@@ -144,5 +145,5 @@ def checkpoint() -> dict[str, bytes]:
 
 
 def try_checkpoint(folder: Path) -> None:
-    if latest_checkpoint(folder, lambda _: None) is None:
+    if latest_checkpoint(folder, unheard) is None:
         raise StageError("train.no-state", "no checkpoint", "the only one is damaged", "-")

@@ -50,7 +50,7 @@ def photographed(
             write_png(inputs["ingest"] / masked, mask)
         kept.append(View(f"{index}.png", file, 0, pose, 2.0, 4.0, "train" if index % 4 else "test", masked))
     still = Similarity(1.0, np.eye(3), np.zeros(3))
-    scene = Scene((CAMERA,), tuple(kept), still, bounded, channels == 4, "around", True)
+    scene = Scene((CAMERA,), tuple(kept), still, bounded, channels == 4, "object-centric", True)
     write_json(inputs["normalise"] / "scene.json", scene.to_json())
     write_tensors(inputs["normalise"] / "points.safetensors", seen_points(scene))
     return inputs, scene

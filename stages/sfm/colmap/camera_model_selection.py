@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float, Int
 
+from stages.contract import Note
 from stages.sfm.colmap.camera_models import MODELS, CameraModelCandidate, degenerate_cameras, set_camera_models
 from stages.sfm.colmap.observations import Observations, noise_px, observations, residuals
 
@@ -56,7 +57,7 @@ class CameraModels:
     noise_px: float
     chosen: dict[int, CameraModelCandidate] = field(default_factory=dict)
     table: list[dict[str, Any]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    notes: list[Note] = field(default_factory=list)
 
 
 def choose(mapped: pycolmap.Reconstruction, seed: int, models: Sequence[str] = MODELS) -> CameraModels:
@@ -82,9 +83,8 @@ def choose(mapped: pycolmap.Reconstruction, seed: int, models: Sequence[str] = M
         choice.table += [row | {"group": index, "photos": photos} for row in rows]
         whose = f"{photos} photo{'s' * (photos != 1)}: " if len(selections) > 1 else ""
         given = " as given" if len(models) == 1 else ""
-        choice.notes.append(
-            f"{whose}camera model {candidate.model}{given}, principal point {candidate.principal_point_state}: {why}"
-        )
+        which = f"camera model {candidate.model}{given}, principal point {candidate.principal_point_state}"
+        choice.notes.append(Note("sfm.camera-model", f"{whose}{which}: {why}"))
     return choice
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from stages.contract import Note
 from stages.sfm.colmap.camera_model_selection import CameraModels, adjustment_options, choose
 from stages.sfm.colmap.camera_models import MODELS, degenerate_cameras, set_camera_models
 from stages.sfm.colmap.mapping import pipeline_options
@@ -26,7 +27,7 @@ class AdjustedModel:
 
     model: pycolmap.Reconstruction
     camera_models: list[dict[str, Any]]  # the comparison, a row per candidate (registration.json)
-    notes: list[str]
+    notes: list[Note]
     uncertainty_px: dict[str, float]  # by the image's name
     left_out: dict[str, str]  # by the image's name, why its camera cannot be used: it has no place any more
 
@@ -47,7 +48,9 @@ def final_bundle_adjustment(
     the tracks that it has are adjusted first; then all matches come back.
     """
     if camera_is_known:
-        choice = CameraModels(noise_px(mapped, observations(mapped)), notes=["the camera is kept as given"])
+        choice = CameraModels(
+            noise_px(mapped, observations(mapped)), notes=[Note("sfm.camera-kept", "the camera is kept as given")]
+        )
         model = pycolmap.Reconstruction(mapped)
         adjust = _adjust_thinned if thinned else _adjust
         adjust(model, database, seed, set(model.cameras), adjustment_options(False, choice.noise_px))
@@ -79,7 +82,12 @@ def _simplify_degenerate(model: pycolmap.Reconstruction, database: Path, seed: i
     set_camera_models(model, dict.fromkeys(cameras, SIMPLEST))
     _adjust(model, database, seed, set(model.cameras) - cameras, adjustment_options(False, choice.noise_px))
     photos = f"{len(degenerate)} photo{'s' * (len(degenerate) != 1)}"
-    choice.notes.append(f"{photos}: the camera is degenerate ({next(iter(degenerate.values()))}): {SIMPLEST} instead")
+    choice.notes.append(
+        Note(
+            "sfm.camera-replaced",
+            f"{photos}: the camera is degenerate ({next(iter(degenerate.values()))}): {SIMPLEST} instead",
+        )
+    )
 
 
 def _camera(model: pycolmap.Reconstruction, image_id: int) -> pycolmap.Camera:
@@ -104,9 +112,9 @@ def _finished(model: pycolmap.Reconstruction, choice: CameraModels, left_out: di
     try:
         uncertainty = pose_uncertainty_px(model, choice.noise_px)
     except np.linalg.LinAlgError:
-        notes = [*notes, f"{untold}: the points leave some of them free to move"]
+        notes = [*notes, Note("sfm.poses-undetermined", f"{untold}: the points leave some of them free to move")]
     except MemoryError as error:
-        notes = [*notes, f"{untold}: {str(error) or 'memory ran out'}"]
+        notes = [*notes, Note("sfm.uncertainty-memory", f"{untold}: {str(error) or 'memory ran out'}")]
     by_name = {model.image(i).name: px for i, px in uncertainty.items()}
     return AdjustedModel(model, choice.table, notes, by_name, left_out)
 

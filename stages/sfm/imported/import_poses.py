@@ -65,7 +65,7 @@ def write_imported_model(
     progress.update(f"reading the cameras of {cameras.name}")
     known = read_poses(cameras, photos, read_frame_names(ingest), convention)
     for note in known.notes:
-        progress.note(note)
+        progress.note(*note)
     write_model(folder / "sparse", known.model)
     errors = read_model(folder / "sparse").error_px  # computed anew: what the given model says of them may be anything
     if lost := int((~np.isfinite(errors)).sum()):
@@ -102,7 +102,7 @@ def _check(
     posed = {image.file for image in model.images}
     check = check_imported_poses([photo for photo in photos if photo.image_name in posed], ingest / "images", folder)
     if why := check.get("failed"):
-        progress.note(f"the imported poses could not be checked: {why}")
+        progress.note("sfm.poses-unchecked", f"the imported poses could not be checked: {why}")
         return None
     return check
 
@@ -111,12 +111,14 @@ def _note_doubts(check: dict[str, Any], model: SparseModel, photos: Sequence[Pho
     """Note where photos contradict their imported poses."""
     if 2 * check["agreeing"] < check["pairs"]:
         progress.note(
+            "sfm.poses-contradict",
             f"the imported poses contradict their photos: {check['agreeing']} of {check['pairs']} verified pairs agree "
-            "with them, and more do under no other convention. Check what they are of, or leave out --cameras"
+            "with them, and more do under no other convention. Check what they are of, or leave out --cameras",
         )
     elif check["doubtful"]:
         names = {photo.image_name: photo.name for photo in photos}
         who = listed([names[file] for file in check["doubtful"]], MAX_NAMES)
         progress.note(
-            f"{len(check['doubtful'])} of {len(model.images)} imported poses contradict what their photos show: {who}"
+            "sfm.doubtful-poses",
+            f"{len(check['doubtful'])} of {len(model.images)} imported poses contradict what their photos show: {who}",
         )

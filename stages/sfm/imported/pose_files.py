@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf.geometry.scene import Camera
-from stages.contract import StageError
+from stages.contract import Note, StageError
 from stages.ingest.sources import LLFF, own_registration
 from stages.io.colmap_files import MAX_COORDINATE
 from stages.io.photos import Photo
@@ -57,7 +57,7 @@ class ImportedPoses:
     model: SparseModel
     left_out: dict[str, str]
     test_files: list[str] | None
-    notes: list[str]
+    notes: list[Note]
 
     def account(self, photos: Sequence[Photo]) -> list[dict[str, Any]]:
         """What became of each photo, for registration.json."""
@@ -146,9 +146,10 @@ def _from_transforms(
         if held_out and not test_files:
             notes.append(none_among_the_photos(len(held_out), where))
     if repeated:
-        notes.append(f"{len(repeated)} frames are listed twice, alike: {_few(repeated)}")
+        notes.append(Note("sfm.repeated-frames", f"{len(repeated)} frames are listed twice, alike: {_few(repeated)}"))
     if approximate:
-        notes.append(f"the camera models of {approximate} frames are approximations, as their notes in the file say")
+        words = f"the camera models of {approximate} frames are approximations, as their notes in the file say"
+        notes.append(Note("sfm.approximate-cameras", words))
     if not framed:
         raise _nothing_matches(splits[0][0], absent, photos)
     notes += _contradictions([content for _, content in splits], framed)
@@ -160,10 +161,12 @@ def _from_transforms(
     unposed = [photo.name for photo in photos if photo.image_name not in framed.keys() | unused.keys()]
     kept_tests = sorted(set(test_files) - left_out.keys())
     if test_files and not kept_tests:
-        notes.append("all official test photos are among those left out, so others are held out")
+        words = "all official test photos are among those left out, so others are held out"
+        notes.append(Note("sfm.tests-left-out", words))
     if unused:
         names = _few(sorted(photo.name for photo in unused.values()))
-        notes.append(f"{len(unused)} photos are neither to train nor to test on and are left out: {names}")
+        words = f"{len(unused)} photos are neither to train nor to test on and are left out: {names}"
+        notes.append(Note("sfm.in-no-split", words))
     return ImportedPoses(
         model=SparseModel.without_points(*distinct(kept)),
         left_out=left_out | dict.fromkeys(unused, "the transforms file has it neither to train nor to test on"),
@@ -177,7 +180,7 @@ def _two_frames(photo: str, first: str, second: str) -> StageError:
     return StageError("sfm.two-frames", f"two frames for the photo {photo} differ", which, HINT)
 
 
-def _split(content: Mapping[str, Any], source: str, notes: list[str]) -> tuple[set[PurePosixPath], set[PurePosixPath]]:
+def _split(content: Mapping[str, Any], source: str, notes: list[Note]) -> tuple[set[PurePosixPath], set[PurePosixPath]]:
     """The official test photos by file_path, nerfstudio's ``test_filenames``, else its ``val_filenames``, less those
     that its ``train_filenames`` have as well; and the frames that are in no split, where there are such. What is
     repeated is noted."""
@@ -186,13 +189,18 @@ def _split(content: Mapping[str, Any], source: str, notes: list[str]) -> tuple[s
     for key in ("test_filenames", "val_filenames"):
         names = _listed(content, key, source, notes)
         if repeated := len(names & train):
-            notes.append(f"{key} of {source} repeats {repeated} photos to train on: they stay that")
+            notes.append(
+                Note(
+                    "sfm.tests-repeat-training",
+                    f"{key} of {source} repeats {repeated} photos to train on: they stay that",
+                )
+            )
         if own := names - train:
             return own, of_frames - train - own if train else set()
     return set(), of_frames - train if train else set()
 
 
-def _listed(content: Mapping[str, Any], key: str, source: str, notes: list[str]) -> set[PurePosixPath]:
+def _listed(content: Mapping[str, Any], key: str, source: str, notes: list[Note]) -> set[PurePosixPath]:
     """The photos in a list of a transforms file, by file_path. Of names that no frame has, a note is left. Raises
     StageError where none has a frame."""
     names = content.get(key) or []
@@ -207,14 +215,22 @@ def _listed(content: Mapping[str, Any], key: str, source: str, notes: list[str])
             f"none of them is the file_path of a frame: {_few(strange)}",
         )
     if strange:
-        notes.append(f"{len(strange)} photos in {key} of {source} have no frame: {_few(strange)}")
+        notes.append(
+            Note(
+                "sfm.split-photos-unknown", f"{len(strange)} photos in {key} of {source} have no frame: {_few(strange)}"
+            )
+        )
     return set(map(PurePosixPath, names))
 
 
-def _contradictions(files: Sequence[Mapping[str, Any]], framed: Mapping[str, _Framed]) -> list[str]:
+def _contradictions(files: Sequence[Mapping[str, Any]], framed: Mapping[str, _Framed]) -> list[Note]:
     """Notes on what files and frames say of a camera twice and not alike."""
     size = next((one.photo.width, one.photo.height) for one in framed.values())
-    notes = [f"of all frames: {what}" for content in files for what in contradictions(content, *size)]
+    notes = [
+        Note("sfm.file-contradicts-itself", f"of all frames: {what}")
+        for content in files
+        for what in contradictions(content, *size)
+    ]
     of_frames = {
         one.frame["file_path"]: what
         for one in framed.values()
@@ -223,7 +239,7 @@ def _contradictions(files: Sequence[Mapping[str, Any]], framed: Mapping[str, _Fr
     if of_frames:
         name, what = next(iter(of_frames.items()))
         more = f" ({len(of_frames) - 1} more frames likewise)" if len(of_frames) > 1 else ""
-        notes.append(f"frame {name!r}: {'; '.join(what)}{more}")
+        notes.append(Note("sfm.frame-contradicts-itself", f"frame {name!r}: {'; '.join(what)}{more}"))
     return notes
 
 
@@ -301,15 +317,25 @@ def _nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> _Rotation:
     return _Rotation(u @ vt, scale, float(off))
 
 
-def _rounded_or_scaled(rotations: Mapping[str, _Rotation]) -> list[str]:
+def _rounded_or_scaled(rotations: Mapping[str, _Rotation]) -> list[Note]:
     """Notes on matrices, by their frames' names, that are not rotations as they stand."""
     notes = []
     if rounded := {name: r.stretch_deg for name, r in rotations.items() if r.stretch_deg > NOTED_STRETCH_DEG}:
         off = f"off by up to {max(rounded.values()):.2g}°"
-        notes.append(f"the rotations of {len(rounded)} frames are rounded, {off}: {_few(list(rounded))}")
+        notes.append(
+            Note(
+                "sfm.rounded-rotations",
+                f"the rotations of {len(rounded)} frames are rounded, {off}: {_few(list(rounded))}",
+            )
+        )
     if scaled := {name: r.scale for name, r in rotations.items() if abs(r.scale - 1) > SCALED_WITHIN}:
         by = " to ".join(f"{scale:.4g}" for scale in sorted({min(scaled.values()), max(scaled.values())}))
-        notes.append(f"the matrices of {len(scaled)} frames scale by {by}, which is left out: {_few(list(scaled))}")
+        notes.append(
+            Note(
+                "sfm.scaled-matrices",
+                f"the matrices of {len(scaled)} frames scale by {by}, which is left out: {_few(list(scaled))}",
+            )
+        )
     return notes
 
 
@@ -371,11 +397,20 @@ def _from_colmap(folder: Path, photos: Sequence[Photo], convention: PoseConventi
         left_out,
     )
     if others := [pair for one in kept.values() if (pair := _other_ending(one.name, one.photo))]:
-        notes.append(f"{len(others)} photos have the cameras of files with another ending: {_few(others)}")
+        notes.append(
+            Note(
+                "sfm.other-endings",
+                f"{len(others)} photos have the cameras of files with another ending: {_few(others)}",
+            )
+        )
     if not len(given.xyz):
-        notes.append("the model has no points: near and far are taken from where its cameras stand and look")
+        notes.append(
+            Note(
+                "sfm.no-points", "the model has no points: near and far are taken from where its cameras stand and look"
+            )
+        )
     if behind:
-        notes.append(f"{behind} observations of points behind their cameras are left out")
+        notes.append(Note("sfm.points-behind", f"{behind} observations of points behind their cameras are left out"))
     return ImportedPoses(model, left_out, None, notes)
 
 
@@ -501,24 +536,26 @@ def _nothing_matches(source: str, names: Sequence[str], photos: Sequence[Photo])
         "sfm.no-camera-matches",
         f"no camera in {source} belongs to a photo",
         f"it is of {_few(names, MAX_NAMES_OF_ERROR)}, and the photos are {here}",
-        "Give the folder of the very photos that the cameras were made for.",
+        "Give the folder of the photos that these cameras belong to.",
     )
 
 
 def _notes(
     absent: Collection[str], unposed: Collection[str], posed: Collection[PosedPhoto], left_out: Collection[str]
-) -> list[str]:
+) -> list[Note]:
     notes = []
     bent = [one.photo.name for one in posed if one.file in left_out]
-    for names, what in (
-        (absent, "cameras have no photo"),
-        (unposed, "photos have no camera and are left out"),
-        (bent, "photos have a camera without a ray for some of their pixels and are left out"),
+    for names, code, what in (
+        (absent, "sfm.no-photo", "cameras have no photo"),
+        (unposed, "sfm.no-camera", "photos have no camera and are left out"),
+        (bent, "sfm.no-rays", "photos have a camera without a ray for some of their pixels and are left out"),
     ):
         if names:
-            notes.append(f"{len(names)} {what}: {_few(sorted(names))}")
+            notes.append(Note(code, f"{len(names)} {what}: {_few(sorted(names))}"))
     if turned := sum(one.turns > 0 and one.file not in left_out for one in posed):
-        notes.append(f"{turned} cameras are turned upright like their photos (EXIF orientation)")
+        notes.append(
+            Note("sfm.turned-upright", f"{turned} cameras are turned upright like their photos (EXIF orientation)")
+        )
     return notes
 
 

@@ -54,7 +54,7 @@ def _turns(photo: Photo, camera: Camera, name: str, upright: bool) -> int:
         raise StageError(
             "sfm.mirrored-photo",
             f"cannot use the camera of {name!r}",
-            f"the EXIF orientation {photo.orientation} of {photo.name} mirrors the photo, and no camera sees mirrored",
+            f"the EXIF orientation {photo.orientation} of {photo.name} mirrors the photo, which no camera pose can do",
             "Leave the cameras out, or make them for photos that are saved upright, without an EXIF orientation.",
         )
     return QUARTER_TURNS[photo.orientation]

@@ -97,7 +97,7 @@ def check_matcher(matcher: Matcher | None, priors: CapturePriors) -> None:
         raise StageError(
             "sfm.no-positions",
             "cannot select pairs of photos by GPS position",
-            "not all photos tell by EXIF where they were taken",
+            "not all photos have a GPS position in their EXIF data",
             "Leave out --sfm.matcher, or try --sfm.matcher retrieval.",
         )
 
@@ -118,7 +118,10 @@ def chosen(
     pairs = expected_pairs(matcher, count, neighbours)
     if matcher != "exhaustive":
         everything = expected_pairs("exhaustive", count, neighbours)
-        progress.note(f"{count} photos have {everything:,} pairs: {WAYS[matcher].format(neighbours)}, about {pairs:,}")
+        progress.note(
+            "sfm.pair-selection",
+            f"{count} photos have {everything:,} pairs: {WAYS[matcher].format(neighbours)}, about {pairs:,}",
+        )
     if seconds_given is None or len(levels) == 1 or _max_seconds(count, pairs) <= MATCHING_FRACTION * seconds_given:
         return ChosenOptions(*levels[0], matcher)
     progress.update("measuring what features and matches of a few photos take")
@@ -129,7 +132,7 @@ def chosen(
             break
         if (shorter := _measured(photos, images, less, matcher).of(count, pairs)) <= MAX_TIME_RATIO * seconds:
             level, seconds = less, shorter
-    progress.note(_level_message(count, levels[0], level, full, seconds))
+    progress.note("sfm.quality-level", _level_message(count, levels[0], level, full, seconds))
     return ChosenOptions(*level, matcher)
 
 
@@ -172,7 +175,7 @@ def _measured(photos: Sequence[Photo], images: Path, level: QualityLevel, matche
         why = lines[-1] if lines else f"COLMAP ended with {answer.returncode}"
         every = f"--sfm.matcher exhaustive --sfm.max-image-size {level.max_image_size}"
         hint = f"Say how, and nothing is measured: {every} --sfm.max-features {level.max_features}."
-        raise StageError("sfm.not-measured", "could not measure what features and matches take", why, hint)
+        raise StageError("sfm.not-measured", "could not measure how long features and matches take", why, hint)
     return Cost(**json.loads(answer.stdout))
 
 

@@ -122,8 +122,9 @@ def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress |
     chosen = next(fitting, [wanted, *smaller][-1])
     if chosen is not wanted and progress:
         progress.note(
+            "train.memory-limits-grids",
             f"{_grids(chosen)}: {_grids(wanted)}, which the budget could fill, take {bytes_in_words(bytes_of(wanted))} "
-            f"while they are trained, and {bytes_in_words(free)} of memory are free"
+            f"while they are trained, and {bytes_in_words(free)} of memory are free",
         )
     return config.filled({"grid": chosen})
 

@@ -22,7 +22,7 @@ def chosen_space(decisions: "Decisions", scene: "Scene") -> tuple["Space", str]:
     """The space that a field is to have, and the reason in words."""
     if "background" not in decisions.on:
         return "bounded", "bounded: nothing is seen beyond the region of interest"
-    if scene.capture_type != "forward":
+    if scene.capture_type != "forward-facing":
         return "contracted", "contracted: the background is unbounded, and the photos do not face one way"
     pyramid = enclosing_pyramid(scene)
     if pyramid is None:

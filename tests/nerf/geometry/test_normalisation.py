@@ -26,9 +26,9 @@ from tests.camera_layouts import (
 )
 
 SCENES = {
-    "around": lambda: seen_by(ring(), ball()),
-    "forward": lambda: seen_by(wall(), wall_points()),
-    "inside": lambda: seen_by(room(), room_points()),
+    "object-centric": lambda: seen_by(ring(), ball()),
+    "forward-facing": lambda: seen_by(wall(), wall_points()),
+    "inside-out": lambda: seen_by(room(), room_points()),
 }
 
 
@@ -54,8 +54,8 @@ def test_layouts_are_told_apart(capture_type: str) -> None:
 
 
 def test_a_wide_arc_is_around_a_narrow_one_forward() -> None:
-    assert find_capture_type(seen_by(ring(arc_deg=110.0), ball())) == "around"
-    assert find_capture_type(seen_by(ring(arc_deg=30.0), ball())) == "forward"
+    assert find_capture_type(seen_by(ring(arc_deg=110.0), ball())) == "object-centric"
+    assert find_capture_type(seen_by(ring(arc_deg=30.0), ball())) == "forward-facing"
 
 
 @pytest.mark.parametrize("capture_type", SCENES)
@@ -78,7 +78,7 @@ def test_up_becomes_z_and_the_frame_is_a_rotation(capture_type: str) -> None:
 
 
 def test_a_facade_faces_plus_y() -> None:
-    found = normalise(SCENES["forward"](), None)
+    found = normalise(SCENES["forward-facing"](), None)
     np.testing.assert_allclose(found.scene_from_sfm.rotation, np.eye(3), atol=1e-9)
 
 
@@ -88,7 +88,7 @@ def test_the_ground_lies_flat_along_the_flight(shaken: float) -> None:
     poses = survey()
     poses[:, :, :3] = nearest_rotations(poses[:, :, :3] + np.random.default_rng(1).normal(0, shaken, (48, 3, 3)))
     found = normalise(seen_by(poses, ground()), None, Witness(0.01, np.array([0.0, 0, 1]), "GPS"))
-    assert (found.capture_type, found.up.known) == ("forward", True)
+    assert (found.capture_type, found.up.known) == ("forward-facing", True)
     xyz = found.scene_from_sfm.points(ground(relief=0.0))
     assert np.ptp(xyz[:, 2]) < 0.06
     east = found.scene_from_sfm.rotation @ [1.0, 0, 0]
@@ -154,7 +154,7 @@ def test_every_observed_point_but_outliers_lies_between_near_and_far(capture_typ
 def test_near_lies_before_what_only_other_photos_have_points_of(views: int, behind: int) -> None:
     """The foremost part of a thing, on which matching fails in some photos: their near must not cut it off, however
     many points there are farther away."""
-    scene = SCENES["around"]()
+    scene = SCENES["object-centric"]()
     if behind:
         scene = with_points(scene, np.array([0.0, 0.0, -40.0]) + ball(behind, 10.0), 3)
     close = scene.distances() < 4.0
@@ -166,7 +166,7 @@ def test_near_lies_before_what_only_other_photos_have_points_of(views: int, behi
 
 
 def test_far_lies_behind_what_only_other_photos_have_points_of() -> None:
-    scene = with_points(SCENES["around"](), np.array([0.0, 300.0, 0.0]) + ball(100, 5.0), 16)
+    scene = with_points(SCENES["object-centric"](), np.array([0.0, 300.0, 0.0]) + ball(100, 5.0), 16)
     unmatched = ~np.isin(scene.view, [7, 9, 10]) & (scene.point >= 400)
     matched = dataclasses.replace(scene, view=scene.view[~unmatched], point=scene.point[~unmatched])
     found = normalise(matched, None)
@@ -175,7 +175,7 @@ def test_far_lies_behind_what_only_other_photos_have_points_of() -> None:
 
 
 def test_near_clusters_of_many_points_are_no_false_matches() -> None:
-    scene = SCENES["around"]()
+    scene = SCENES["object-centric"]()
     rail = scene.centres[0] + 0.05 * scene.axes[0] + 0.01 * ball(30)
     found, clean = normalise(with_points(scene, rail, 4), None), normalise(scene, None)
     assert found.near[0] < 0.05 * found.scene_from_sfm.scale < 0.05 * clean.near[0] / 0.7 * 3
@@ -194,7 +194,7 @@ def test_near_lies_before_what_photos_see_in_large_scenes() -> None:
 
 
 def test_unsure_or_unseen_points_do_not_set_near() -> None:
-    scene = SCENES["around"]()
+    scene = SCENES["object-centric"]()
     centre, axis, right = scene.centres[0], scene.axes[0], scene.rights[0]
     jitter = 0.01 * ball(50)
 
@@ -310,13 +310,13 @@ def test_cameras_in_one_place_are_refused_wherever_it_is(offset: float) -> None:
 
 
 def test_only_alpha_proves_that_nothing_lies_beyond() -> None:
-    around = SCENES["around"]()
+    around = SCENES["object-centric"]()
     assert normalise(opaque_everywhere(around), None).bounded
     assert not normalise(around, None).bounded, "sky and plain walls have no points"
 
 
 def test_unbounded_scenes_reach_far_behind_the_farthest_point() -> None:
-    found = normalise(with_points(SCENES["around"](), 30 * ball(60), views=4), None)
+    found = normalise(with_points(SCENES["object-centric"](), 30 * ball(60), views=4), None)
     assert (found.far >= 20).all()
     assert (found.far <= 1000).all()
 
@@ -336,7 +336,7 @@ def test_without_points_the_cameras_frusta_give_the_region() -> None:
     assert not normalise(scene, None).bounded
 
 
-@pytest.mark.parametrize("poses", [wall(), room()], ids=["forward", "inside"])
+@pytest.mark.parametrize("poses", [wall(), room()], ids=["forward-facing", "inside-out"])
 def test_without_points_other_layouts_get_a_region_too(poses: np.ndarray) -> None:
     found = normalise(seen_by(poses, np.zeros((0, 3))), None)
     spread = np.linalg.norm(poses[:, :, 3] - np.median(poses[:, :, 3], axis=0), axis=1).max()
@@ -345,7 +345,7 @@ def test_without_points_other_layouts_get_a_region_too(poses: np.ndarray) -> Non
 
 
 def test_a_given_region_is_taken_as_it_is() -> None:
-    scene = SCENES["around"]()
+    scene = SCENES["object-centric"]()
     found = normalise(scene, (0.2, -0.1, 0.3, 2.5))
     np.testing.assert_allclose(found.scene_from_sfm.points(np.array([0.2, -0.1, 0.3])), 0, atol=1e-12)
     assert region_half(found) == pytest.approx(2.5)
@@ -372,7 +372,7 @@ def test_lego_fills_the_region_and_stays_inside(shared_data) -> None:
         scene, ray_directions=ray_directions / np.linalg.norm(ray_directions, axis=-1, keepdims=True)
     )
     found = normalise(opaque_everywhere(scene), None)
-    assert found.capture_type == "around"
+    assert found.capture_type == "object-centric"
     assert found.bounded
     assert angles_deg(found.up.direction, np.array([0.0, 0.0, 1.0])) < 1e-3
     corners = np.array([[-0.65, -1.15, -0.5], [0.65, 1.15, 1.05]])  # of the lego itself, in Blender's units

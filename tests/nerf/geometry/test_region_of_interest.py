@@ -28,7 +28,7 @@ def with_misplaced_group(scene: Reconstruction, share: float) -> Reconstruction:
 def test_a_misplaced_group_leaves_layout_and_region_as_they_are(share: float) -> None:
     scene = rings(292)
     right, wrong = normalise(scene, None), normalise(with_misplaced_group(scene, share), None)
-    assert right.capture_type == wrong.capture_type == "around"
+    assert right.capture_type == wrong.capture_type == "object-centric"
     assert region_half(wrong) == pytest.approx(region_half(right), rel=0.05)
     assert angles_deg(wrong.up.direction, right.up.direction) < 1
     middle = right.scene_from_sfm.points(wrong.scene_from_sfm.inverse().points(np.zeros((1, 3))))

@@ -61,7 +61,7 @@ def scene() -> Scene:
         scene_from_sfm=turned(1.0, 0.3, [1, 2, 3]),
         bounded=False,
         has_alpha=True,
-        capture_type="inside",
+        capture_type="inside-out",
         up_known=True,
     )
 
@@ -73,7 +73,7 @@ def test_json_gives_back_every_bit() -> None:
     assert again.cameras == scene().cameras
     assert np.array_equal(again.views[0].scene_from_camera, scene().views[0].scene_from_camera)
     assert np.array_equal(again.scene_from_sfm.rotation, scene().scene_from_sfm.rotation)
-    assert (again.bounded, again.has_alpha, again.capture_type, again.up_known) == (False, True, "inside", True)
+    assert (again.bounded, again.has_alpha, again.capture_type, again.up_known) == (False, True, "inside-out", True)
 
 
 def test_another_version_is_refused() -> None:

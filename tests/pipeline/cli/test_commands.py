@@ -66,7 +66,7 @@ def test_help_of_run_lists_the_stage_options(capsys: pytest.CaptureFixture[str])
         (["--budget", "2m", "--train.steps", "50"], "--budget 2m and --train.steps 50: so many steps take as "
          "long as they take; leave out one, or give --train.seconds"),
         (["--budget", "2m", "--until", "tradeoff"], "--budget and --until tradeoff: a study has a budget of its own"),
-        (["--more", "9m", "--config", "a.toml"], "--more goes on with the recorded options, not with those of --config "
+        (["--more", "9m", "--config", "a.toml"], "--more uses the recorded options, not those of --config "
          "a.toml; leave --config out, and give what is to change as flags"),
         (["--train.stepz", "5"], "Unrecognized options: --train.stepz, 5; perhaps --train.steps"),
     ],
@@ -264,7 +264,7 @@ def test_budgets_are_spent_by_runs_alone(tmp_path: Path, capsys: pytest.CaptureF
     assert " s of 5 min spent →" in run_on(tmp_path / "photos", capsys, "--until", "ingest", "--budget", "5m")[1]
     before = json.loads((tmp_path / "w.nerf/run.json").read_text())["budget"]
     assert run_command(["ingest", str(tmp_path / "w.nerf"), "--force"]) == 0
-    assert "spent" not in capsys.readouterr().out
+    assert " spent →" not in capsys.readouterr().out
     assert json.loads((tmp_path / "w.nerf/run.json").read_text())["budget"] == before
 
 

@@ -20,7 +20,7 @@ def say_everything(display: Display) -> None:
     for stage in ("sfm", "train"):
         display.begin(stage)
         display.update("step 1", 0.5)
-        display.note("a note " * 2000)  # more than a buffer holds
+        display.note("train.code", "a note " * 2000)  # more than a buffer holds
         display.end(stage, "it is done", 1.0, cached=False)
     display.failed("train", StageError("train.code", "what", "why", "what to try"))
     display.finished("at last", {})
@@ -136,7 +136,7 @@ def test_plain_output_is_not_flooded(capsys: pytest.CaptureFixture[str]):
     display.begin("train")
     for k in range(1000):
         display.update(f"step {k}", k / 1000)
-    display.note("a line that stays")
+    display.note("train.code", "a line that stays")
     assert capsys.readouterr().out == "train      a line that stays\n"
 
 

@@ -28,7 +28,9 @@ def write_output(folder: Path, poses: dict[str, np.ndarray], camera: Camera = LE
         View(name, name, 0, SFM_FROM_TRUTH.pose(pose), near=1.0, far=9.0, split="train") for name, pose in poses.items()
     ]
     own = Similarity(1.0, np.eye(3), np.zeros(3))
-    scene = Scene((camera,), tuple(views), own, bounded=True, has_alpha=False, capture_type="around", up_known=True)
+    scene = Scene(
+        (camera,), tuple(views), own, bounded=True, has_alpha=False, capture_type="object-centric", up_known=True
+    )
     (folder / "transforms.json").write_text(json.dumps(transforms(scene)))
     return folder
 

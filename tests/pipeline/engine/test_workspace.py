@@ -38,7 +38,7 @@ def test_photos_below_the_folder_for_the_results_are_safe(tmp_path: Path, capsys
     for k in range(3):
         Image.new("RGB", (4, 4), (k, 0, 0)).save(photos / f"{k}.png")
     assert run_command(["run", str(photos), "-o", str(tmp_path / "project")]) == 3
-    assert f"{photos} is none of this program's results" in capsys.readouterr().err
+    assert f"{photos} was not made by this program" in capsys.readouterr().err
     assert len([*photos.iterdir()]) == 3
     assert [path.name for path in (tmp_path / "project").iterdir()] == ["output"], "nothing has been written"
 
@@ -205,7 +205,7 @@ def test_photos_in_place_of_their_workspace_are_told_its_name(
         (tmp_path / folder).mkdir()
     (tmp_path / "photos.nerf/run.json").write_text("{}")
     assert run_command(["status", "photos/"]) == 3
-    assert "try: The workspace that is called after it is photos.nerf." in capsys.readouterr().err
+    assert "try: The workspace with its name is photos.nerf." in capsys.readouterr().err
 
 
 def test_files_are_synced_where_that_takes_the_right_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

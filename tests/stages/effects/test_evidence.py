@@ -57,7 +57,9 @@ def geometric(
         "xy": xy.reshape(-1, 2).astype(np.float32),
     }
     camera = Camera("PINHOLE", width, height, (focal, focal, width / 2, height / 2))
-    scene = Scene((camera,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), False, False, "around", True)
+    scene = Scene(
+        (camera,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), False, False, "object-centric", True
+    )
     places = observed_places(folder, scene, points, {view.file: width / 2000 for view in views})
     return {"pose_refinement": pose_statistic(places), "rolling_shutter": rolling_shutter_statistic(places)}
 

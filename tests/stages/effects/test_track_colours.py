@@ -83,7 +83,7 @@ def photographed_points(
 
 
 def _scene(views: list[View]) -> Scene:
-    return Scene((CAMERA,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), False, False, "around", True)
+    return Scene((CAMERA,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), False, False, "object-centric", True)
 
 
 def without_points(points: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

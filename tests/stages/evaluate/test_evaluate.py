@@ -103,7 +103,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
         width, height = scale * WIDTH, scale * HEIGHT
         camera = Camera("SIMPLE_PINHOLE", width, height, (scale * FOCAL, width / 2, height / 2))
         identity = Similarity(1.0, np.eye(3), np.zeros(3))
-        scene = Scene((camera,), tuple(views), identity, False, alpha, "inside", True)
+        scene = Scene((camera,), tuple(views), identity, False, alpha, "inside-out", True)
         write_json(inputs["normalise"] / "scene.json", scene.to_json())
         info = {"kind": "sky", "downscale": downscale, "background": [0.0, 0.0, 0.0], "effects": {}}
         write_json(inputs["train"] / "field.json", info)

@@ -237,7 +237,7 @@ def test_words_for_what_cannot_be_used(tmp_path: Path) -> None:
         "empty": "empty is empty: there is no file in it. Give the folder that holds the photos: pipeline run FOLDER",
         "texts": f"no photos in {tmp_path}/texts: its 2 files are no images (.md, .txt). "
         "Give the folder that holds the photos: pipeline run FOLDER",
-        "videos": f"2 videos in {tmp_path}/videos: a/b.MOV, clip.mp4: which one is meant is not clear. "
+        "videos": f"2 videos in {tmp_path}/videos: a/b.MOV, clip.mp4: it is not clear which one to use. "
         f"Give one of them: pipeline run {tmp_path}/videos/a/b.MOV",
         "one/a.JPG": "a.JPG is a single image: a scene needs many photos from different places. Give the folder",
         "odd/a.xyz": "cannot use a.xyz: it is no folder of photos, video or transforms.json.",
@@ -364,11 +364,11 @@ def test_dead_links_are_refused_by_name(tmp_path: Path) -> None:
     assert names(find_source(tmp_path)) == ["a.jpg", "b.jpg"] and not is_gone(tmp_path)
     (tmp_path / "a.jpg").unlink()
     error = refusal(tmp_path)
-    assert (error.what, error.why) == (f"no photos in {tmp_path}", "1 of its files are links to what is not there")
+    assert (error.what, error.why) == (f"no photos in {tmp_path}", "1 of its files are broken links")
     assert is_gone(tmp_path)
     touch(tmp_path, "notes.txt")
     (tmp_path / "b.jpg").rename(tmp_path / "b.mp4")
-    assert refusal(tmp_path).why == "1 of its files are links to what is not there"
+    assert refusal(tmp_path).why == "1 of its files are broken links"
 
 
 def test_a_dead_linked_folder_is_skipped(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ def scene_of(cameras: tuple[Camera, ...], sfm_poses: np.ndarray) -> Scene:
         )
         for i, pose in enumerate(sfm_poses)
     )
-    return Scene(cameras, views, SCENE_FROM_SFM, False, False, "around", True)
+    return Scene(cameras, views, SCENE_FROM_SFM, False, False, "object-centric", True)
 
 
 def test_poses_are_opengl_and_in_the_sfm_frame() -> None:

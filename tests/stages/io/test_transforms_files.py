@@ -11,7 +11,7 @@ from stages.contract import StageError
 from stages.io.photos import Photo
 from stages.io.transforms_files import read_transforms
 from stages.sfm.imported.pose_files import ImportedPoses, read_poses
-from tests.refusals import refused
+from tests.refusals import codes, refused
 
 LENS = {"camera_angle_x": 0.7}
 
@@ -38,9 +38,7 @@ def known(folder: Path, **splits: list[dict[str, Any]]) -> ImportedPoses:
 
 NAMES = {f["file_path"]: f"{f['file_path']}.png".removeprefix("./") for f in (*TRAIN, *TEST, *VAL, *COPY)}
 PHOTOS = [Photo(name, f"images/{name}", 6, 4, 0, None, None, False, 1.0) for name in sorted(set(NAMES.values()))]
-REPEATS = "transforms_test.json repeats 2 frames of transforms_train.json: they stay photos to train on"
-FROM_VAL = "the test photos are those of transforms_val.json: transforms_test.json gives none"
-NOT_THERE = "none of the 1 test photos of transforms_test.json is among the photos"
+REPEATS, FROM_VAL, NOT_THERE = "io.tests-repeat-training", "io.tests-from-validation", "io.no-test-photos"
 
 
 @pytest.mark.parametrize(
@@ -64,7 +62,7 @@ def test_the_test_photos_of_blender_folders(
 ) -> None:
     found = known(tmp_path, train=TRAIN, **splits)
     assert found.test_files == test_files
-    assert [note for note in found.notes if "have no" not in note] == notes
+    assert [code for code in codes(found.notes) if code.startswith("io.")] == notes
     assert {"train/0.png", "train/1.png"} <= {image.file for image in found.model.images}
 
 
@@ -88,8 +86,7 @@ def test_test_frames_of_one_file_are_test_photos(tmp_path: Path) -> None:
     file.write_text(json.dumps({**LENS, "frames": TRAIN, "test_frames": COPY}))
     found = read_poses(file, PHOTOS, NAMES)
     assert found.test_files is None
-    repeats = "test_frames of transforms.json repeats 2 frames of transforms.json: they stay photos to train on"
-    assert found.notes[-1] == repeats
+    assert found.notes[-1].code == REPEATS
     for wrong, why in (({}, "it is no list"), ([{}], "frame 0 lacks file_path or transform_matrix")):
         file.write_text(json.dumps({**LENS, "frames": TRAIN, "test_frames": wrong}))
         with pytest.raises(StageError) as raised:

@@ -131,7 +131,7 @@ def test_other_rules_ignore_the_photos(keep, kept):
 @pytest.mark.parametrize(
     ("in_frustum", "message"),
     [
-        (1, "no part of the surface lies in the photos: none of its 4 faces"),
+        (1, "no part of the surface lies within the photos' frusta: none of its 4 faces"),
         (2, "no part of the surface is visible"),
     ],
 )

@@ -85,7 +85,7 @@ def scene_around(count=12):
         split = "test" if number % 8 == 0 else "train"
         views.append(View(f"{number}.jpg", f"images/{number}.png", 0, pose, 1.0, 6.0, split))
     camera = Camera("SIMPLE_RADIAL", 80, 60, (75.0, 40.0, 30.0, 0.02))
-    return Scene((camera,), tuple(views), SCENE_FROM_SFM, True, False, "around", True)
+    return Scene((camera,), tuple(views), SCENE_FROM_SFM, True, False, "object-centric", True)
 
 
 @pytest.fixture
@@ -249,7 +249,7 @@ def test_a_plain_ends_at_box_or_photos(run_mesh):
 def test_flat_scenes_have_smaller_voxels(run_mesh):
     """The same plain, by points on it that photos have which do not stand around it."""
     points = np.random.default_rng(0).uniform([-0.9, -0.9, -0.25], [0.9, 0.9, -0.15], (1000, 3)).astype(np.float32)
-    scene = replace(scene_around(), capture_type="inside")
+    scene = replace(scene_around(), capture_type="inside-out")
     cube, _ = run_mesh(Solid(plain), scene=scene, frame="scene")
     result, folder = run_mesh(Solid(plain), folder="flat", scene=scene, points=points, frame="scene")
     assert cube.facts["voxel"] == pytest.approx(VOXEL) and 0.4 * VOXEL < result.facts["voxel"] < 0.6 * VOXEL
@@ -293,7 +293,7 @@ def test_resolution_for_seconds_follows_the_box(run_mesh, monkeypatch):
     monkeypatch.setattr(resolution, "reference_seconds", lambda: 0.02)
     monkeypatch.setattr(resolution, "density_query_seconds", lambda train, box: asked.append(box) or 2e-7)
     points = np.random.default_rng(0).uniform([-0.9, -0.9, -0.25], [0.9, 0.9, -0.15], (1000, 3)).astype(np.float32)
-    for capture_type in ("around", "inside"):
+    for capture_type in ("object-centric", "inside-out"):
         scene = replace(scene_around(), capture_type=capture_type)
         run_mesh(Solid(plain), scene=scene, points=points, resolution=None, seconds=1.0)
     cube, flat = asked

@@ -31,7 +31,7 @@ def shows_all(camera):
 
 @pytest.mark.parametrize(("last", "turned"), [((-2, -0.5, 0.4), 180.0), ((0.5, -2.0, 0.2), -90.0)])
 def test_an_object_is_shown_from_the_photos_side(last, turned):
-    scene = scene_of("around", [(-0.1, 0, 3), (2, 0.5, 1.1), last])
+    scene = scene_of("object-centric", [(-0.1, 0, 3), (2, 0.5, 1.1), last])
     one, other = viewpoints(CUBE, scene)
     assert shows_all(one) and shows_all(other)
     side = -one.from_camera[:, 2]
@@ -43,7 +43,7 @@ def test_an_object_is_shown_from_the_photos_side(last, turned):
 
 
 def test_a_facade_is_shown_from_the_cameras():
-    scene = scene_of("forward", [(-1, -3, 0), (0, -3, 0), (1.5, -3, 0)])
+    scene = scene_of("forward-facing", [(-1, -3, 0), (0, -3, 0), (1.5, -3, 0)])
     one, other = viewpoints(CUBE, scene)
     assert shows_all(one) and shows_all(other)
     np.testing.assert_allclose(one.from_camera[:, 2], [0, 1, 0], atol=1e-12)
@@ -51,7 +51,7 @@ def test_a_facade_is_shown_from_the_cameras():
 
 
 def test_a_photo_that_was_held_sideways_shows_the_mesh_upright():
-    scene = scene_of("forward", [(-1, -3, 0), (0, -3, 0), (1.5, -3, 0)])
+    scene = scene_of("forward-facing", [(-1, -3, 0), (0, -3, 0), (1.5, -3, 0)])
     upright = viewpoints(CUBE, scene)
     turns = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     views = tuple(
@@ -63,7 +63,7 @@ def test_a_photo_that_was_held_sideways_shows_the_mesh_upright():
 
 
 def test_a_room_is_shown_from_inside():
-    scene = scene_of("inside", [(0, 0, 0), (0.3, 0, 0)], target=(0.0, 5, 0))
+    scene = scene_of("inside-out", [(0, 0, 0), (0.3, 0, 0)], target=(0.0, 5, 0))
     one, other = viewpoints(CUBE, scene)
     np.testing.assert_allclose(one.from_camera[:, 3], [0, 0, 0])
     np.testing.assert_allclose(other.from_camera[:, 3], [0.3, 0, 0])
@@ -75,7 +75,7 @@ def test_the_picture_has_two_rows_of_colour_and_clay(monkeypatch, centre):
     monkeypatch.setattr("stages.mesh.preview.HEIGHT", 30)
     faces = np.array([[0, 2, 4], [2, 6, 4], [1, 5, 3], [3, 5, 7]], np.int32)
     red = np.tile(np.array([220, 20, 20], np.uint8), (8, 1))
-    image = preview(ColouredMesh(CUBE, faces, CUBE, red), scene_of("around", [centre])).astype(int)
+    image = preview(ColouredMesh(CUBE, faces, CUBE, red), scene_of("object-centric", [centre])).astype(int)
     assert image.shape == (60, 80, 3)
     redness = image[..., 0] - image[..., 1]
     assert (redness[:, :40] > 60).any() and redness[:, 40:].max() < 20

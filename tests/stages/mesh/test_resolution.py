@@ -59,7 +59,7 @@ def test_the_yardstick_is_the_best_of_a_few(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize(("points", "flat"), [(GROUND, 2), (FACADE, 1)])
-@pytest.mark.parametrize("capture_type", ["forward", "inside"])
+@pytest.mark.parametrize("capture_type", ["forward-facing", "inside-out"])
 def test_a_flat_scenes_grid_spans_its_slice(points, flat, capture_type):
     stray = np.array([[0.1, 0.1, 0.85], [0.5, 0.85, 0.1], [0.0, 0.0, 30.0]])
     box = grid_box(capture_type, np.concatenate([points, stray]))
@@ -72,12 +72,12 @@ def test_a_flat_scenes_grid_spans_its_slice(points, flat, capture_type):
 @pytest.mark.parametrize(
     ("points", "capture_type"),
     [
-        (GROUND, "around"),  # the vase on the table is bare
-        (GROUND * [0.5, 0.5, 1], "forward"),  # a poster on a bare wall
-        (GROUND * [1, 1, 5] + [0, 0, 0.8], "forward"),
-        (GROUND[: MIN_POINTS - 1], "forward"),
-        (GROUND[:0], "forward"),
-        (GROUND + np.array([0, 0, 5]), "inside"),
+        (GROUND, "object-centric"),  # the vase on the table is bare
+        (GROUND * [0.5, 0.5, 1], "forward-facing"),  # a poster on a bare wall
+        (GROUND * [1, 1, 5] + [0, 0, 0.8], "forward-facing"),
+        (GROUND[: MIN_POINTS - 1], "forward-facing"),
+        (GROUND[:0], "forward-facing"),
+        (GROUND + np.array([0, 0, 5]), "inside-out"),
     ],
 )
 def test_the_grid_spans_the_region_without_flat_points(points, capture_type):
@@ -87,7 +87,7 @@ def test_the_grid_spans_the_region_without_flat_points(points, capture_type):
 @pytest.mark.parametrize("resolution", [16, 48, 77, 256])
 def test_a_flat_box_has_as_many_points_and_smaller_voxels(resolution):
     assert points_per_edge(CUBE, resolution) == resolution and slab_factor(CUBE) == pytest.approx(1)
-    box = grid_box("forward", GROUND)
+    box = grid_box("forward-facing", GROUND)
     along = points_per_edge(box, resolution)
     per_edge = (box[1] - box[0]) / 1.8 * (along - 1) + 1
     assert along > 1.3 * resolution

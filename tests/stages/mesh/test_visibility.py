@@ -23,7 +23,7 @@ IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 def scene_of(*centres, camera=PINHOLE, near=0.5, far=6.0, target=(0, 0, 0)):
     poses = look_at(np.array(centres, float), np.array(target, float))
     views = tuple(View(f"{i}.png", f"images/{i}.png", 0, pose, near, far, "train") for i, pose in enumerate(poses))
-    return Scene((camera,), views, IDENTITY, True, False, "around", True)
+    return Scene((camera,), views, IDENTITY, True, False, "object-centric", True)
 
 
 @pytest.fixture(scope="module")

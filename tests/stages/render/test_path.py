@@ -37,7 +37,7 @@ def test_photos_of_one_focal_length_share_their_median() -> None:
 def test_a_few_photos_held_sideways_do_not_tilt_a_spiral() -> None:
     poses = wall()
     poses[:5, :, :2] = np.stack([poses[:5, :, 1], -poses[:5, :, 0]], axis=2)
-    scene = scene_with(poses, "forward")
+    scene = scene_with(poses, "forward-facing")
     assert default_path(scene) == "spiral"
     path = make_path(scene, "spiral", 30).poses
     assert (np.abs(path[:, 2, 0]) < 1e-9).all() and (path[:, 2, 1] < -0.9).all()

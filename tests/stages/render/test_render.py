@@ -53,7 +53,7 @@ class Ball:
         return Rendering(torch.where(hit[:, None], colour, background), torch.where(hit, t, rays.far), hit.to(t.dtype))
 
 
-def scene_with(poses: np.ndarray, capture_type: CaptureType = "around", camera: Camera = CAMERA) -> Scene:
+def scene_with(poses: np.ndarray, capture_type: CaptureType = "object-centric", camera: Camera = CAMERA) -> Scene:
     views = tuple(
         View(f"{i}.jpg", f"images/{i}.png", 0, pose, 1.0, 9.0, "train" if i else "test") for i, pose in enumerate(poses)
     )
@@ -189,11 +189,11 @@ def test_nothing_is_timed_where_nothing_is_open(inputs, progress) -> None:
 @pytest.mark.parametrize(
     ("poses", "capture_type", "up_known", "path"),
     [
-        (ring(), "around", True, "orbit"),
-        (ring(), "around", False, "interpolated"),  # about which axis?
-        (wall(), "forward", False, "spiral"),
-        (wall(columns=40), "forward", True, "interpolated"),  # 12 wide, from 4 away
-        (wall(), "inside", True, "interpolated"),
+        (ring(), "object-centric", True, "orbit"),
+        (ring(), "object-centric", False, "interpolated"),  # about which axis?
+        (wall(), "forward-facing", False, "spiral"),
+        (wall(columns=40), "forward-facing", True, "interpolated"),  # 12 wide, from 4 away
+        (wall(), "inside-out", True, "interpolated"),
     ],
 )
 def test_the_layout_chooses_the_path(
@@ -207,7 +207,7 @@ def test_the_layout_chooses_the_path(
 def test_along_photos_that_face_one_way_the_horizon_is_level() -> None:
     poses = wall(columns=40)
     poses[::2, :, :2] *= -1  # upside down
-    path = make_path(scene_with(poses, "forward"), "interpolated", 30).poses
+    path = make_path(scene_with(poses, "forward-facing"), "interpolated", 30).poses
     assert (path[:, 2, 1] < -0.99).all()
 
 

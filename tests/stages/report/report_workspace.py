@@ -116,7 +116,7 @@ def _scene(names: list[str], size: tuple[int, int]) -> Scene:
         split = "train" if i % 4 else "test"
         views.append(View(name, f"images/{i:04d}.png", 0, pose, 0.5, 4.0, split))
     camera = Camera("SIMPLE_PINHOLE", *size, (1.2 * size[0], size[0] / 2, size[1] / 2))
-    return Scene((camera,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), True, False, "around", True)
+    return Scene((camera,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), True, False, "object-centric", True)
 
 
 def _write_training(folder: Path) -> None:

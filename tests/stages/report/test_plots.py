@@ -30,7 +30,7 @@ def _scene(count: int = 9) -> Scene:
         pose = np.stack([right, np.cross(forward, right), forward, -2 * forward], axis=1)
         views.append(View(f"{i}.jpg", f"images/{i}.jpg", 0, pose, 0.5, 4.0, "train" if i % 8 else "test"))
     camera = Camera("OPENCV", 640, 480, (500.0, 500.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0))
-    return Scene((camera,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), True, False, "around", True)
+    return Scene((camera,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), True, False, "object-centric", True)
 
 
 def _curve() -> list[dict[str, Any]]:
@@ -102,7 +102,7 @@ def test_the_prediction_lies_inside_the_plot(monkeypatch: pytest.MonkeyPatch):
 
 def test_the_cameras_plot_says_up_where_known():
     scene = _scene()
-    blind = Scene(scene.cameras, scene.views, scene.scene_from_sfm, True, False, "around", False)
+    blind = Scene(scene.cameras, scene.views, scene.scene_from_sfm, True, False, "object-centric", False)
     points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     assert list(camera_svgs(scene, scene.views, *points, True)) == ["from above", "from the side"]
     assert list(camera_svgs(blind, scene.views, *points, True)) == ["along z", "along y"]

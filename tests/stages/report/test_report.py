@@ -323,7 +323,7 @@ def test_training_shows_where_its_time_went(inputs: dict[str, Path], tmp_path: P
     assert "<h3>Where training spent its time</h3>" in html
     assert re.search(r"backward</td>.*?50\.0%.*?70%", html)
     assert "take 60% of its time" in html and "The limit is then 7.2 k rays/s; these steps reached 3.9 k" in html
-    assert "They computed 49 k samples/s: per ray 30.0 densities and 12.5 colours." in html
+    assert "They computed 49 k colours/s: per ray 30.0 densities and 12.5 colours." in html
     widths = [float(width) for width in re.findall(r'<i style="width: ([\d.]+)%; background', html)]
     assert widths == [50, 30, 10, 10]
 

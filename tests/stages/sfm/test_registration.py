@@ -180,7 +180,7 @@ def test_few_features_are_named_where_they_match_something_too() -> None:
             0,
             "1 of 10 pairs of photos share a view, but none of them shows the depth of the scene",
         ),
-        (matches((0, 1)), 2, "only 2 photos and 7 points fit together; 1 of 10 pairs share a view"),
+        (matches((0, 1)), 2, "only 2 photos and 7 points were reconstructed; 1 of 10 pairs share a view"),
     ],
 )
 def test_why_no_scene_can_be_made(found: Matches, registered: int, why: str) -> None:

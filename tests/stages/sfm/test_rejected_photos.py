@@ -71,7 +71,7 @@ def test_too_few_photos_are_refused_at_once(count: int, tmp_path: Path, progress
         (
             {"camera_params": (250.0, 120.0, 90.0)},
             [(240, 180)],
-            "the model that they are the parameters of is not given",
+            "they need --sfm.camera-model",
         ),
         (
             {"camera_model": "RADIAL", "camera_params": (250.0, 120.0, 90.0)},

@@ -130,10 +130,10 @@ def test_a_damaged_database_is_made_anew(
 @pytest.mark.parametrize(
     ("child", "message"),
     [
-        ("import os; os.abort()", r"was ended by SIGABRT while extracting features: COLMAP failed inside \(it left no"),
-        ("import os; os.kill(os.getpid(), 9)", "was ended by SIGKILL .*: most often the machine ran out of memory"),
+        ("import os; os.abort()", r"was killed by SIGABRT while extracting features: COLMAP crashed \(it left no"),
+        ("import os; os.kill(os.getpid(), 9)", "was killed by SIGKILL .*: most often the machine ran out of memory"),
         ("raise ValueError('no such thing')", "failed while extracting features: ValueError: no such thing"),
-        ("import time; time.sleep(60)", "was given up while extracting features: it took longer than 0.5 s"),
+        ("import time; time.sleep(60)", "was stopped while extracting features: it took longer than 0.5 s"),
     ],
 )
 def test_however_the_child_ends_it_is_an_error_with_words(
@@ -279,10 +279,10 @@ def with_a_stranger(inputs: dict[str, Path], folder: Path) -> dict[str, Path]:
 @pytest.mark.parametrize(
     ("end", "message", "became"),
     [
-        ("os.abort()", "was ended by SIGABRT .*skips the strategy 'relaxed ratio test'", "ended the program"),
+        ("os.abort()", "was killed by SIGABRT .*skips the strategy 'relaxed ratio test'", "ended the program"),
         (
             "os.kill(os.getpid(), 9)",
-            "was ended by SIGKILL .*ran out of memory. Run again: it skips",
+            "was killed by SIGKILL .*ran out of memory. Run again: it skips",
             "was killed, most often for want of memory",
         ),
         ("int('x')", "failed while mapping: ValueError.*Run again: it skips", "ended the program"),

@@ -6,6 +6,7 @@ import torch
 
 from stages.io.files import write_durably
 from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
+from tests.refusals import no_note, unheard
 
 
 def checkpoint(step: int) -> Checkpoint:
@@ -19,7 +20,7 @@ def saved(folder: Path, *steps: int) -> Path:
 
 
 def test_what_was_saved_comes_back_bit_for_bit(tmp_path: Path) -> None:
-    found = latest_checkpoint(saved(tmp_path / "new", 7), pytest.fail)
+    found = latest_checkpoint(saved(tmp_path / "new", 7), no_note)
     assert found is not None
     assert (found.step, found.facts) == (7, {"seconds": 7 / 3})
     assert torch.equal(found.tensors["weight"], checkpoint(7).tensors["weight"])
@@ -32,15 +33,15 @@ def test_the_last_two_are_kept(tmp_path: Path) -> None:
 
 
 def test_without_a_checkpoint_there_is_none(tmp_path: Path) -> None:
-    assert latest_checkpoint(tmp_path, pytest.fail) is None
-    assert latest_checkpoint(tmp_path / "missing", pytest.fail) is None
+    assert latest_checkpoint(tmp_path, no_note) is None
+    assert latest_checkpoint(tmp_path / "missing", no_note) is None
 
 
 def test_of_a_finished_run_nothing_is_removed(tmp_path: Path) -> None:
     saved(tmp_path, 3, 4)
     (tmp_path / "000000004.safetensors").write_bytes(b"")
     before = {path.name for path in tmp_path.iterdir()}
-    found = latest_checkpoint(tmp_path, lambda _: None, remove=False)
+    found = latest_checkpoint(tmp_path, unheard, remove=False)
     assert found is not None and found.step == 3
     assert {path.name for path in tmp_path.iterdir()} == before
 
@@ -61,19 +62,19 @@ def test_a_damaged_checkpoint_is_named_and_skipped(tmp_path: Path, harm: str) ->
         tensors.unlink()
     else:
         meta.write_text("{}")
-    said: list[str] = []
-    found = latest_checkpoint(tmp_path, said.append)
+    said: list[tuple[str, str]] = []
+    found = latest_checkpoint(tmp_path, lambda *note: said.append(note))
     assert found is not None and found.step == 3
-    assert len(said) == 1 and said[0].startswith("the checkpoint of step 4 is damaged (")
-    assert said[0].endswith("); using the one before")
-    assert latest_checkpoint(tmp_path, pytest.fail) is not None
+    ((code, text),) = said
+    assert code == "train.checkpoint-skipped" and "step 4" in text
+    assert latest_checkpoint(tmp_path, no_note) is not None
 
 
 def test_a_kill_before_the_json_leaves_no_checkpoint(tmp_path: Path) -> None:
     saved(tmp_path, 1)
     (tmp_path / "000000002.safetensors").write_bytes(b"half")
     (tmp_path / "000000002.json.tmp").write_bytes(b"{")
-    found = latest_checkpoint(tmp_path, pytest.fail)
+    found = latest_checkpoint(tmp_path, no_note)
     assert found is not None and found.step == 1
     saved(tmp_path, 3)
     assert not list(tmp_path.glob("*2.*"))
@@ -82,7 +83,7 @@ def test_a_kill_before_the_json_leaves_no_checkpoint(tmp_path: Path) -> None:
 def test_not_finite_facts_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not JSON compliant"):
         save_checkpoint(tmp_path, Checkpoint(1, {}, {"loss": float("nan")}))
-    assert latest_checkpoint(tmp_path, pytest.fail) is None
+    assert latest_checkpoint(tmp_path, no_note) is None
 
 
 def test_writing_replaces_the_whole_file(tmp_path: Path) -> None:
@@ -103,7 +104,7 @@ def test_no_flipped_bit_of_either_file_passes(tmp_path: Path) -> None:
             for each, kept in whole.items():
                 each.write_bytes(kept)
             path.write_bytes(content[:place] + bytes([content[place] ^ 1 << place % 8]) + content[place + 1 :])
-            found = latest_checkpoint(tmp_path, lambda _: None)
+            found = latest_checkpoint(tmp_path, unheard)
             assert found is None or found.facts == checkpoint(3).facts, f"byte {place} of {path.name}"
             assert found is None or torch.equal(found.tensors["weight"], checkpoint(3).tensors["weight"])
 
@@ -112,18 +113,19 @@ def test_a_checkpoint_under_another_step_does_not_pass(tmp_path: Path) -> None:
     saved(tmp_path, 3)
     for path in list(tmp_path.iterdir()):
         path.rename(tmp_path / path.name.replace("3", "4"))
-    assert latest_checkpoint(tmp_path, lambda _: None) is None
+    assert latest_checkpoint(tmp_path, unheard) is None
 
 
 @pytest.mark.parametrize("fault", [RuntimeError("another field"), TypeError("an unknown fact")])
 def test_a_checkpoint_of_something_else_is_named_and_skipped(tmp_path: Path, fault: Exception) -> None:
     saved(tmp_path, 3, 4)
-    said: list[str] = []
+    said: list[tuple[str, str]] = []
 
     def fits(found: Checkpoint) -> None:
         if found.step == 4:
             raise fault
 
-    found = latest_checkpoint(tmp_path, said.append, fits)
+    found = latest_checkpoint(tmp_path, lambda *note: said.append(note), fits)
     assert found is not None and found.step == 3
-    assert said == [f"the checkpoint of step 4 belongs to another training ({fault}); using the one before"]
+    ((code, text),) = said
+    assert code == "train.checkpoint-skipped" and "step 4" in text and str(fault) in text

@@ -12,6 +12,7 @@ from stages.train import loop
 from stages.train.checkpoints import latest_checkpoint
 from stages.train.loop import TrainingRun
 from stages.train.state import TrainingBudget, TrainingSpeed, checkpoint_interval
+from tests.refusals import no_note
 from tests.stages.train.one_number import Killed, OneNumber, killed_at, number_of, run_in, slow
 
 
@@ -88,7 +89,7 @@ def test_what_a_kill_loses_is_spent(
     on_clock = (tmp_path, progress, monkeypatch, 60.0)
     with pytest.raises(Killed):
         run_on_a_made_up_clock(*on_clock, lambda _: 0.2, 29.0, checkpoint_seconds)
-    checkpoint = latest_checkpoint(tmp_path / "checkpoints", pytest.fail)
+    checkpoint = latest_checkpoint(tmp_path / "checkpoints", no_note)
     assert checkpoint is not None and kept <= checkpoint.facts["seconds"] < kept + 2
     run = run_on_a_made_up_clock(*on_clock, lambda _: 0.2 * factor, checkpoint_seconds=checkpoint_seconds)
     again = run.state.seconds - checkpoint.facts["seconds"]

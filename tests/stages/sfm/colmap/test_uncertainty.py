@@ -6,6 +6,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from stages.contract import Note
 from stages.sfm.colmap import uncertainty
 from stages.sfm.colmap.camera_model_selection import CameraModels
 from stages.sfm.colmap.final_bundle_adjustment import _finished
@@ -104,9 +105,9 @@ def test_lack_of_room_is_told_and_the_model_stands(how: str, monkeypatch: pytest
     else:
         monkeypatch.setattr(uncertainty, "_whitened_covariance", Mock(side_effect=MemoryError()))
         words = "memory ran out"
-    finished = _finished(model, CameraModels(0.5, notes=["the camera is kept as given"]), {})
+    finished = _finished(model, CameraModels(0.5, notes=[Note("sfm.camera-kept", "")]), {})
     assert finished.model is model and finished.uncertainty_px == {}
-    assert finished.notes[1:] == [f"how well the poses are known cannot be told: {words}"]
+    assert finished.notes[1].code == "sfm.uncertainty-memory" and words in finished.notes[1].text
 
 
 def test_where_nothing_was_seen_nothing_is_known() -> None:

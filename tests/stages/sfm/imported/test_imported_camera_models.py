@@ -56,9 +56,8 @@ def test_photos_whose_lens_folds_in_the_corners_are_left_out(read: Any, tmp_path
     known = read(tmp_path, [1], 5)
     assert [image.file for image in known.model.images] == ["0.jpg", "2.jpg", "3.jpg", "4.jpg"]
     assert [camera.model for camera in known.model.cameras] == ["PINHOLE"]
-    assert known.notes == [
-        "1 photos have a camera without a ray for some of their pixels and are left out: 1.jpg",
-    ]
+    (note,) = known.notes
+    assert note.code == "sfm.no-rays" and "1.jpg" in note.text
     account = known.account(photos(5))
     assert [entry["registered"] for entry in account] == [True, False, True, True, True]
     assert [entry["reason"] for entry in account] == [
@@ -78,7 +77,7 @@ def test_photos_whose_lens_folds_in_the_corners_are_left_out(read: Any, tmp_path
 def test_that_no_test_photo_is_left_is_said(tmp_path: Path) -> None:
     known = from_transforms(tmp_path, [0, 1], 5)
     assert known.test_files is None
-    assert known.notes[-1] == "all official test photos are among those left out, so others are held out"
+    assert known.notes[-1].code == "sfm.tests-left-out"
 
 
 @pytest.mark.parametrize("read", [from_transforms, from_colmap])

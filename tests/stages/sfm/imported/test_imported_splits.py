@@ -9,6 +9,7 @@ import pytest
 
 from stages.contract import StageError
 from stages.sfm.imported.pose_files import ImportedPoses, read_poses
+from tests.refusals import codes
 from tests.stages.sfm.imported.test_pose_files import LENS, NAMES, PHOTOS, frame
 
 
@@ -44,7 +45,7 @@ def test_photos_in_no_split_are_left_out_by_name(read) -> None:
     assert [image.file for image in known.model.images] == ["a0.png", "a2.png"]
     assert known.test_files == ["a2.png"]
     assert known.left_out == {"a1.png": "the transforms file has it neither to train nor to test on"}
-    assert known.notes == ["1 photos are neither to train nor to test on and are left out: ä1.png"]
+    assert codes(known.notes) == ["sfm.in-no-split"] and "ä1.png" in known.notes[0].text
 
 
 @pytest.mark.parametrize("key", ["test_filenames", "val_filenames"])
@@ -52,19 +53,19 @@ def test_test_photos_that_are_trained_on_stay_that(read, key: str) -> None:
     everything = ["0", "1", "2"]
     known = read([frame(i) for i in range(3)], **LENS, **{"train_filenames": everything, key: everything})
     assert len(known.model.images) == 3 and known.test_files is None
-    assert known.notes == [f"{key} of transforms.json repeats 3 photos to train on: they stay that"]
+    assert codes(known.notes) == ["sfm.tests-repeat-training"] and key in known.notes[0].text
 
 
 def test_test_photos_without_a_frame_are_named(read) -> None:
     known = read([frame(i) for i in range(3)], **LENS, test_filenames=["./2", "./7"])
     assert known.test_files == ["a2.png"]
-    assert known.notes == ["1 photos in test_filenames of transforms.json have no frame: ./7"]
+    assert codes(known.notes) == ["sfm.split-photos-unknown"] and "./7" in known.notes[0].text
 
 
 def test_test_photos_that_are_not_there_are_said(read) -> None:
     known = read([frame(i) for i in (0, 1, 7)], **LENS, test_filenames=["7"])
     assert known.test_files is None
-    assert known.notes[-1] == "none of the 1 test photos of transforms.json is among the photos"
+    assert known.notes[-1].code == "io.no-test-photos"
 
 
 @pytest.mark.parametrize(

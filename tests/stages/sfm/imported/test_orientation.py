@@ -22,7 +22,7 @@ from stages.sfm.colmap.models import read_model, write_model
 from stages.sfm.imported.orientation import QUARTER_TURNS, pixel_map, turned_camera, turned_pose
 from stages.sfm.imported.pose_files import ImportedPoses, read_poses
 from tests.camera_layouts import ring
-from tests.refusals import refused
+from tests.refusals import codes, refused
 from tests.stages.ingest.photo_files import exif_with
 
 WIDTH, HEIGHT = 60, 40
@@ -117,8 +117,7 @@ def test_cameras_of_stored_pixels_turn_with_their_photos(
     given = Camera("OPENCV", width, height, OPENCV.params)
     expected = places(width, height)[..., :2].reshape(-1, 2)
     np.testing.assert_array_equal(stored_places(model, pixels, given, ring(4)[0]), expected)
-    turned = "4 cameras are turned upright like their photos (EXIF orientation)"
-    assert (turned in progress.notes) == (orientation != 1)
+    assert ("sfm.turned-upright" in progress.codes) == (orientation != 1)
 
 
 @pytest.mark.parametrize("orientation", [3, 6])
@@ -166,8 +165,7 @@ def test_one_camera_that_only_fits_upright_tells_it_of_all(kind: str, alone: boo
         images = [SparseImage(name, i, pose) for i, (name, pose) in enumerate(zip(names, ring(5), strict=False))]
         write_model(tmp_path, SparseModel.without_points(cameras, images))
     known = read_poses(given, photos, {name: name for name in names})
-    turns = ["1 cameras are turned upright like their photos (EXIF orientation)"]
-    assert [note for note in known.notes if "turned" in note] == (turns if alone else [])
+    assert ("sfm.turned-upright" in codes(known.notes)) == alone
 
 
 def turned_photo(orientation: int, name: str = "p.jpg") -> Photo:

@@ -16,7 +16,7 @@ from stages.io.transforms_export import intrinsics
 from stages.sfm.colmap.models import write_model
 from stages.sfm.imported.conventions import PoseConvention
 from stages.sfm.imported.pose_files import ImportedPoses, _by_name, read_poses
-from tests.refusals import refused
+from tests.refusals import codes, refused
 
 W, H = 60, 40
 
@@ -169,7 +169,7 @@ def test_contradictory_intrinsics_are_named(
     read, own: dict[str, Any], shared: dict[str, Any], named: list[str]
 ) -> None:
     (note,) = read([frame(0), frame(1, **own), frame(2)], **LENS, **shared).notes
-    assert all(part in note for part in named)
+    assert note.code.endswith("-contradicts-itself") and all(part in note.text for part in named)
 
 
 def _with(row: int, column: int, value: float) -> list[list[float]]:
@@ -255,7 +255,7 @@ def test_rounded_rotations_are_projected_and_named(read) -> None:
         np.testing.assert_allclose(rotation, a.sfm_from_camera[:, :3], atol=np.radians(0.05))
     assert exact.notes == []
     (note,) = rounded.notes
-    assert "1 frames" in note and "./1" in note
+    assert note.code == "sfm.rounded-rotations" and "./1" in note.text
 
 
 @pytest.mark.parametrize("scale", [1.05, 0.1, 1000.0])
@@ -267,7 +267,8 @@ def test_the_scale_of_a_matrix_is_left_out_and_named(read, scale: float, frames:
     for scaled, image in zip(known.model.images, plain.model.images, strict=True):
         np.testing.assert_allclose(scaled.sfm_from_camera, image.sfm_from_camera, atol=1e-12)
     (note,) = known.notes
-    assert f"{len(frames)} frames" in note and f"{scale:g}" in note
+    assert note.code == "sfm.scaled-matrices"
+    assert f"{len(frames)} frames" in note.text and f"{scale:g}" in note.text
 
 
 OF_OTHERS = {
@@ -330,7 +331,7 @@ def test_a_matrix_may_be_a_flat_list_of_its_rows(read) -> None:
 
 def test_frames_without_photo_and_photos_without_frame_are_named(read) -> None:
     known = read([frame(0), frame(1), frame(7)], **LENS)
-    assert known.notes == ["1 cameras have no photo: ./7", "1 photos have no camera and are left out: ä2.png"]
+    assert codes(known.notes) == ["sfm.no-photo", "sfm.no-camera"] and "ä2.png" in known.notes[1].text
     assert [entry["registered"] for entry in known.account(PHOTOS)] == [True, True, False]
     assert known.account(PHOTOS)[2]["reason"] == "it has no imported pose"
 
@@ -349,7 +350,7 @@ def test_a_photo_has_one_frame(read) -> None:
 def test_frames_that_are_listed_twice_alike_count_once(read) -> None:
     known = read([frame(0), frame(1), frame(1), frame(2)], **LENS)
     assert [image.file for image in known.model.images] == ["a0.png", "a1.png", "a2.png"]
-    assert known.notes == ["1 frames are listed twice, alike: ./1"]
+    assert codes(known.notes) == ["sfm.repeated-frames"]
 
 
 def test_the_convention_of_poses_may_be_given(tmp_path: Path) -> None:
@@ -383,7 +384,7 @@ def test_blender_folders_keep_their_split(tmp_path: Path, with_test: bool) -> No
 def test_lenses_that_are_said_to_be_approximations_are_noted(read) -> None:
     note = intrinsics(Camera("FOV", W, H, (50.0, 52.0, 31.0, 19.0, 0.9)))["note"]
     known = read([frame(0, note=note), frame(1, note="by hand"), frame(2, note=note)], **LENS)
-    assert known.notes == ["the camera models of 2 frames are approximations, as their notes in the file say"]
+    assert codes(known.notes) == ["sfm.approximate-cameras"] and "2 frames" in known.notes[0].text
 
 
 def colmap_model(folder: Path, names: list[str]) -> SparseModel:
@@ -411,7 +412,7 @@ def test_points_behind_cameras_or_in_them_are_left_out(tmp_path: Path) -> None:
     harmed = dataclasses.replace(given, xyz=np.stack([behind, given.images[1].sfm_from_camera[:, 3]]))
     write_model(tmp_path, harmed)
     known = read_poses(tmp_path, PHOTOS, {})
-    assert "observations of points behind their cameras are left out" in known.notes[-1]
+    assert known.notes[-1].code == "sfm.points-behind"
     seen = known.model
     depth = [
         ((seen.xyz[p] - seen.images[v].sfm_from_camera[:, 3]) @ seen.images[v].sfm_from_camera[:, 2])
@@ -429,7 +430,7 @@ def test_a_colmap_model_is_matched_by_name(tmp_path: Path) -> None:
     np.testing.assert_allclose(known.model.images[0].sfm_from_camera, poses["elsewhere/ä0.png"], atol=1e-12)
     np.testing.assert_allclose(known.model.images[1].sfm_from_camera, poses["ä1.png"], atol=1e-12)
     assert len(known.model.xyz) == 2
-    assert known.notes == ["1 cameras have no photo: other.png", "1 photos have no camera and are left out: ä2.png"]
+    assert codes(known.notes) == ["sfm.no-photo", "sfm.no-camera"] and "other.png" in known.notes[0].text
     assert [entry["observations"] for entry in known.account(PHOTOS)] == [2, 2, 0]
 
 
@@ -499,14 +500,14 @@ def test_cameras_of_photos_with_another_ending_are_taken_and_named(tmp_path: Pat
     colmap_model(tmp_path, ["ä0.jpg", "a1.png", "ä2.png"])
     known = read_poses(tmp_path, PHOTOS, {})
     assert [image.file for image in known.model.images] == ["a0.png", "a1.png", "a2.png"]
-    assert known.notes == ["1 photos have the cameras of files with another ending: ä0.png (ä0.jpg)"]
+    assert codes(known.notes) == ["sfm.other-endings"] and "ä0.png (ä0.jpg)" in known.notes[0].text
 
 
 def test_one_name_that_is_not_clear_leaves_the_other_cameras(tmp_path: Path) -> None:
     colmap_model(tmp_path, ["left/ä0.png", "right/ä0.png", "ä1.png"])
     known = read_poses(tmp_path, PHOTOS, {})
     assert [image.file for image in known.model.images] == ["a1.png"]
-    assert known.notes[0] == "2 cameras have no photo: left/ä0.png, right/ä0.png"
+    assert known.notes[0].code == "sfm.no-photo" and "left/ä0.png, right/ä0.png" in known.notes[0].text
 
 
 def test_the_fox_of_instant_ngp(shared_data: Path) -> None:

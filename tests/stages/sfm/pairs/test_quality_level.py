@@ -94,7 +94,7 @@ def test_nothing_is_measured_without_a_time(progress, monkeypatch: pytest.Monkey
     assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, None) == ChosenOptions(1600, 4096, "exhaustive")
     with pytest.raises(StageError) as caught:
         chosen(ALL_OPEN, photos(400), Path(), 30, progress, 60.0)
-    assert (caught.value.what, caught.value.why) == ("could not measure what features and matches take", "measured")
+    assert (caught.value.what, caught.value.why) == ("could not measure how long features and matches take", "measured")
     assert caught.value.hint == (
         "Say how, and nothing is measured: --sfm.matcher exhaustive --sfm.max-image-size 1600 --sfm.max-features 4096."
     )
@@ -129,7 +129,7 @@ def test_spatial_matching_needs_gps_positions() -> None:
     with pytest.raises(StageError) as caught:
         check_matcher("spatial", CapturePriors())
     assert caught.value.what == "cannot select pairs of photos by GPS position"
-    assert caught.value.why == "not all photos tell by EXIF where they were taken"
+    assert caught.value.why == "not all photos have a GPS position in their EXIF data"
     assert "--sfm.matcher retrieval" in caught.value.hint
 
 

@@ -24,7 +24,7 @@ SMALL = {
 }
 
 
-def scene_of(poses: np.ndarray, capture_type: CaptureType = "forward") -> Scene:
+def scene_of(poses: np.ndarray, capture_type: CaptureType = "forward-facing") -> Scene:
     views = tuple(
         View(f"{i}.jpg", f"{i}.jpg", 0, pose, 0.5, 20.0, "test" if i % 8 == 0 else "train")
         for i, pose in enumerate(poses)
@@ -55,7 +55,7 @@ def test_cameras_that_face_one_way_get_ndc() -> None:
     ("decisions", "scene", "space"),
     [
         (Decisions(), scene_of(wall()), "bounded"),
-        (UNBOUNDED, scene_of(ring(), "around"), "contracted"),
+        (UNBOUNDED, scene_of(ring(), "object-centric"), "contracted"),
         (UNBOUNDED, scene_of(fanned(10.0)), "ndc"),
         (UNBOUNDED, scene_of(fanned(30.0)), "contracted"),
         (UNBOUNDED, scene_of(fanned(60.0)), "contracted"),
