@@ -1,6 +1,6 @@
-"""Train one run of a study, and score any field on evaluation crops of the held-out photos.
+"""Train one run of a study, and score any field as stage evaluate does: in tiles of all test photos.
 
-Every field is scored on the same pixels at the same size, whatever size it was trained at. Crops stand for whole photos
+Every field is scored on the same pixels at the same size, whatever size it was trained at. Tiles stand for whole photos
 because the published networks would take longer to render those than to train.
 """
 
@@ -27,6 +27,7 @@ from stages import train
 from stages.contract import Inputs, Progress, StageError
 from stages.effects.image_effects import photo_effects
 from stages.evaluate.image_metrics import ssim
+from stages.evaluate.tiles import TILE_SIZE, tiles_of
 from stages.io.files import read_json, sync_file, write_json_durably, write_png
 from stages.io.photos import spread
 from stages.io.stopwatch import periodically
@@ -35,12 +36,8 @@ from stages.tradeoff.schedule import SCORING_STRIDE, SMALL_SIDE, WORKSPACE_FIELD
 from stages.train.config import BLACK, WHITE
 from stages.train.data import ALL_MASKED, PhotoReader, scaled_size, view_mask, view_rays
 
-CROP_SIZE = 64  # pixels along an edge
-NUM_SHOWN = 3  # held-out photos kept as pictures
-# Steps between crops that fill a square evenly, however many there are (Roberts 2018, the R2 sequence).
-R2_STEPS = (0.7548776662466927, 0.5698402909980532)
-MIN_UNMASKED = 0.25  # of a crop's pixels
-MAX_POSITIONS = 256  # in a photo, tried for a crop with MIN_UNMASKED
+NUM_SHOWN = 3  # test photos kept as pictures
+TIMED_SIDES = 64  # up to so many equal parts of a photo are rendered to see how fast a field renders
 MEMORY_INTERVAL_SECONDS = 0.05
 RUN_FAILURES = ("train.diverged", "train.collapsed", ALL_MASKED)
 """The errors of stage train where the run itself is at fault: it would fail again."""
@@ -49,69 +46,71 @@ Colour = tuple[float, float, float]
 
 
 class Crop(NamedTuple):
-    """A held-out photo or a part of one: rays and colours (h, w, …), and which pixels count (None: all)."""
+    """A test photo, or some of its tiles, one below the other, of ``tile_rows`` each: rays and colours (h, w, …), and
+    which pixels count (None: all)."""
 
     photo: str
     rays: Rays
     truth: Tensor
     mask: Tensor | None
+    tile_rows: int | None = None
 
     def part(self, place: tuple[slice, slice]) -> "Crop":
         """Some of its rows and columns."""
         mask = None if self.mask is None else self.mask[place]
         return Crop(self.photo, self.rays.each(lambda v: v[place].clone()), self.truth[place].clone(), mask)
 
+    def tiled(self, count: int, number: int) -> "Crop | None":
+        """About ``count`` tiles of the ``number``-th photo; None where masks leave nothing of it."""
+        height, width = self.truth.shape[:2]
+        tiles = tiles_of(height, width, min(1.0, count * TILE_SIZE**2 / (height * width)), number, self.mask)
+        if not len(tiles.corners):
+            return None
+
+        def column(picture: Tensor) -> Tensor:
+            return tiles.cut(picture).flatten(0, 1)
+
+        mask = None if self.mask is None else column(self.mask)
+        return Crop(self.photo, self.rays.each(column), column(self.truth), mask, tiles.size[0])
+
+    def ssim(self, image: Tensor) -> float | None:
+        """Of a render, by windows inside of tiles."""
+        parts = (image, self.truth) if self.mask is None else (image, self.truth, self.mask)
+        return ssim(*(part.unflatten(0, (-1, self.tile_rows or len(part))) for part in parts))
+
 
 @dataclass(frozen=True)
 class Benchmark:
     """What every run of a study is scored on, and whole photos for pictures; make it with :func:`make_benchmark`.
-    ``frame`` is the number of pixels of a whole photo at the size scored at; ``background`` is what photos and fields
+    ``size`` is width and height of a whole photo at the size scored at; ``background`` is what photos and fields
     are shown over, whatever a field was trained over."""
 
     scene: Scene
     crops: tuple[Crop, ...]
     photos: tuple[Crop, ...]
-    frame: int
+    size: tuple[int, int]
     background: Colour
 
 
-def make_benchmark(ingest: Path, scene: Scene, downscale: float, count: int, small: float) -> Benchmark:
-    """``count`` crops spread over the held-out photos at 1/``downscale`` of their size, and NUM_SHOWN of these photos
-    at 1/``small``, large ones still smaller: at most SMALL_SIDE pixels, which the study has time to render."""
+def make_benchmark(ingest: Path, scene: Scene, downscale: float | None, count: int, small: float) -> Benchmark:
+    """About ``count`` tiles of all test photos at 1/``downscale`` of their size (None: the usual one of scores), and
+    NUM_SHOWN of these photos at 1/``small``, large ones still smaller: at most SMALL_SIDE pixels, which the study has
+    time to render."""
     test, background = scene.of_split("test"), WHITE if scene.has_alpha else BLACK
-    whole = (_photo(ingest, scene, test[i % len(test)], downscale, background) for i in range(count))
-    crops = tuple(photo.part(_crop_position(photo, i, count)) for i, photo in enumerate(whole))
+    whole = (_photo(ingest, scene, view, downscale, background) for view in test)
+    parts = (photo.tiled(math.ceil(count / len(test)), number) for number, photo in enumerate(whole))
+    crops = tuple(part for part in parts if part is not None)
     _check_masks(crops)
     shown = [test[i] for i in spread(len(test), min(NUM_SHOWN, len(test)))]
     sides = [max(camera.width, camera.height) for camera in (scene.cameras[view.camera] for view in shown)]
     sizes = [max(small, side / SMALL_SIDE) for side in sides]
     photos = tuple(_photo(ingest, scene, *each, background) for each in zip(shown, sizes, strict=True))
-    width, height = scaled_size(scene.cameras[test[0].camera], downscale)
-    return Benchmark(scene, crops, photos, width * height, background)
+    return Benchmark(scene, crops, photos, scaled_size(scene.cameras[test[0].camera], downscale), background)
 
 
-def _photo(ingest: Path, scene: Scene, view: View, downscale: float, background: Colour) -> Crop:
+def _photo(ingest: Path, scene: Scene, view: View, downscale: float | None, background: Colour) -> Crop:
     truth = PhotoReader(ingest, scene, downscale).pixels(view, background)
     return Crop(view.name, view_rays(scene, view, downscale), truth, view_mask(ingest, scene, view, downscale))
-
-
-def _crop_position(photo: Crop, number: int, count: int) -> tuple[slice, slice]:
-    """Where the ``number``-th of ``count`` crops lies in its photo: at its position of the R2 sequence. Where masks
-    leave less than MIN_UNMASKED of that, at the first of every ``count``-th position from there on, which are no other
-    crop's, with as much; of MAX_POSITIONS the one of which they leave most."""
-    best, most = (slice(None), slice(None)), -1.0
-    for turn in range(number, number + MAX_POSITIONS * count, count):
-        top, left = (
-            int((0.5 + turn * step) % 1 * (max(0, size - CROP_SIZE) + 1))
-            for step, size in zip(R2_STEPS, photo.truth.shape[:2], strict=True)
-        )
-        position = slice(top, top + CROP_SIZE), slice(left, left + CROP_SIZE)
-        unmasked = 1.0 if photo.mask is None else float(photo.mask[position].float().mean())
-        if unmasked > most:
-            best, most = position, unmasked
-        if most >= MIN_UNMASKED:
-            break
-    return best
 
 
 def _check_masks(crops: tuple[Crop, ...]) -> None:
@@ -179,28 +178,29 @@ def strip_file(run: Run, folder: Path) -> Path:
 
 
 def score(field: Path, benchmark: Benchmark, progress: Progress, stride: int = 1) -> dict[str, Any]:
-    """Of the field that stage train left in a folder: PSNR over the pixels of all crops, mean SSIM, seconds a frame.
-    With a ``stride`` only every so many pixels are rendered, along both axes, and there is no SSIM."""
+    """Of the field that stage train left in a folder: PSNR and SSIM, means over the photos, and seconds a frame. With a
+    ``stride`` only every so many pixels are rendered, along both axes, and there is no SSIM."""
     every = slice(None, None, stride)
     crops = [crop.part((every, every)) for crop in benchmark.crops]
     render = _renderer(field, benchmark)
     render(crops[0])  # the first picture pays for memory and kernels
-    errors, similarities, seconds = [], [], 0.0
+    scores, similarities, seconds = [], [], 0.0
     for number, crop in enumerate(crops):
-        progress.update(f"scoring, crop {number + 1} of {len(crops)}", number / len(crops))
+        progress.update(f"scoring, photo {number + 1} of {len(crops)}", number / len(crops))
         started = time.perf_counter()
         image = render(crop)
         seconds += time.perf_counter() - started
         error = (image - crop.truth).square().mean(-1)
-        errors.append(error if crop.mask is None else error[crop.mask])
-        similarities.append(ssim(image, crop.truth, crop.mask) if stride == 1 else None)
+        if crop.mask is None or crop.mask.any():
+            scores.append(psnr(float((error if crop.mask is None else error[crop.mask]).mean())))
+        similarities.append(benchmark.crops[number].ssim(image) if stride == 1 else None)
     known = [similarity for similarity in similarities if similarity is not None]
     rays = sum(crop.rays.near.numel() for crop in crops)
     return {
-        "psnr": round(psnr(float(torch.cat([error.flatten() for error in errors]).mean())), 4),
+        "psnr": round(sum(scores) / len(scores), 4),
         "ssim": round(sum(known) / len(known), 5) if known else None,
         "model_mb": round((field / "field.safetensors").stat().st_size / 1e6, 3),
-        "frame_seconds": round(seconds * benchmark.frame / rays, 4),
+        "frame_seconds": round(seconds * math.prod(benchmark.size) / rays, 4),
     }
 
 
@@ -208,11 +208,11 @@ def rendering_seconds(field: Path, benchmark: Benchmark) -> float:
     """What rendering all crops by the field in a folder takes here, estimated from parts of one of them."""
 
     def sample(side: int) -> Rays:
-        some = slice(None, None, math.ceil(CROP_SIZE / side))
-        return benchmark.crops[0].part((some, some)).rays
+        rows = math.ceil(len(benchmark.crops[0].truth) * side / TIMED_SIDES)
+        return benchmark.crops[0].part((slice(rows), slice(None))).rays
 
     rays = sum(crop.rays.near.numel() for crop in benchmark.crops)
-    return rays / load_renderer(field, benchmark.background).rays_per_second(sample, CROP_SIZE, TIMED_SECONDS)
+    return rays / load_renderer(field, benchmark.background).rays_per_second(sample, TIMED_SIDES, TIMED_SECONDS)
 
 
 def render_photos(field: Path, benchmark: Benchmark) -> list[Tensor]:

@@ -255,7 +255,7 @@ CASES = [
     ),
     Case(
         formula="normalised device coordinates (x/z, y/z, 1 − 2 n/z)",
-        where="nerf/geometry/space_maps.py: Ndc.forward, Ndc.pull_back",
+        where="nerf/geometry/space_maps.py: forward, pull_back",
         domain="all finite points",
         hazard="infinite at z = 0, folded back behind it",
         answer="z is n/1000 at least: what is before the near plane or behind the camera is far outside of the cube",
