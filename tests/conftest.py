@@ -47,6 +47,10 @@ class SilentProgress:
         self.notes.append(text)
         self.codes.append(code)
 
+    def said(self, code: str) -> list[str]:
+        """The notes of this code."""
+        return [text for text, each in zip(self.notes, self.codes, strict=True) if each == code]
+
 
 @pytest.fixture(autouse=True)
 def cores_are_free(monkeypatch: pytest.MonkeyPatch) -> None:

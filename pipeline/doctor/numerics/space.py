@@ -275,7 +275,7 @@ CASES = [
     ),
     Case(
         formula="their inverse, z = 2 n / (1 − z')",
-        where="nerf/geometry/space_maps.py: Ndc.inverse",
+        where="nerf/geometry/space_maps.py: inverse",
         domain="max abs y_i < 0.9",
         hazard="1 − z' cancels; infinite at the far face",
         answer="1 − z' of two float32 numbers is exact near the far face; callers stay half a cell within it",

@@ -257,7 +257,7 @@ def test_until_ingest_then_status_and_explain_and_clean(tmp_path: Path, capsys: 
     assert "0.0 MB in 0 folders" in capsys.readouterr().out
 
 
-def test_budgets_are_spent_by_runs_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_budget_is_of_runs_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "photos").mkdir()
     for k in range(3):
         Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")

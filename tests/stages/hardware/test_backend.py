@@ -48,7 +48,7 @@ def test_warp_is_chosen_where_it_runs_and_nothing_is_said(progress) -> None:
 
 def test_otherwise_torch_is_chosen_and_the_reason_said(useless: None, progress) -> None:
     assert chosen_backend("cuda", progress) == "torch"
-    assert progress.codes.count("hardware.torch-alone") == 1 and NOTE + OLD_DRIVER in progress.notes
+    assert progress.said("hardware.torch-alone") == [NOTE + OLD_DRIVER]
     assert chosen_backend("cuda") == "torch"
 
 
@@ -120,7 +120,7 @@ def test_planning_chooses_and_keeps_a_backend(tmp_path: Path, progress, monkeypa
     assert train.plan(sized, inputs, progress).grid.backend == "warp"
     monkeypatch.setattr(warp, "unavailable_reason", lambda device: OLD_DRIVER)
     assert train.plan(sized, inputs, progress).grid.backend == "torch"
-    assert progress.notes == [NOTE + OLD_DRIVER]
+    assert progress.said("hardware.torch-alone") == [NOTE + OLD_DRIVER]
     with refused("hardware.no-warp", "--train.grid.backend torch"):
         train.plan(tiny("warp", steps=10), inputs, progress)
 

@@ -75,7 +75,7 @@ def test_planning_keeps_the_choice_and_what_was_asked_for(tmp_path: Path, here, 
     inputs, _ = photographed(tmp_path)
     here(FAST)
     planned = train.plan(Config(**TINY, seconds=5), inputs, progress)
-    assert planned.matmul == "medium" and progress.notes == [SAID]
+    assert planned.matmul == "medium" and progress.said("train.matmul-medium") == [SAID]
     here(NOTHING)
     assert train.plan(planned, inputs, progress) == planned
     assert train.plan(Config(**TINY, steps=5, matmul="medium"), inputs, progress).matmul == "medium"

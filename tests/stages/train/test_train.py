@@ -75,7 +75,8 @@ def test_photos_become_a_field_that_beats_a_flat_colour(tmp_path: Path, progress
     assert [point["step"] for point in curve["points"]] == [64, 91, 120]
     assert set(last) == {"step", "seconds", "train_psnr", "probe_psnr", "probe_ssim"}
     assert curve["points"][0]["probe_ssim"] < last["probe_ssim"] < 1
-    assert progress.notes[1] == "vanilla field (2 × 16), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels"
+    (sizes,) = progress.said("train.sizes")
+    assert "120 steps" in sizes and "6 photos at 1/1" in sizes
 
 
 def test_the_grid_field_trains_from_photos_too(tmp_path: Path, progress) -> None:
@@ -89,19 +90,15 @@ def test_the_grid_field_trains_from_photos_too(tmp_path: Path, progress) -> None
     assert 120 * 8 < info["rays"] < 120 * 8192
     colours = result.facts["colours_per_second"] / result.facts["rays_per_second"]
     assert 0.5 < colours < 100, "of a ray"
-    assert progress.notes[1:3] == [
-        "grid field (2 grids of up to 2^10 rows, to 32³), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels",
-        "1,024 colours a step in 2 micro-batches, by warp · samples every 0.057 scene units",
-    ]
+    (sizes,), (step,) = progress.said("train.sizes"), progress.said("train.step")
+    assert "2^10" in sizes and "2.3 k pixels" in sizes and "1,024" in step and "0.057" in step
 
 
 def test_that_samples_stand_farther_apart_with_distance_is_said(tmp_path: Path, progress) -> None:
     inputs, _ = photographed(tmp_path, bounded=False)
     trained(tmp_path / "train", inputs, progress, field="grid", steps=1, grid={"micro_batches": 1, "backend": "torch"})
-    assert progress.notes[2] == (
-        "1,024 colours a step in 1 micro-batch, by torch · samples every 0.042 scene units, "
-        "from 0.25 on every 16.7% of the distance"
-    )
+    (step,) = progress.said("train.step")
+    assert "0.042" in step and "16.7%" in step
 
 
 @pytest.mark.parametrize("field", TRAINERS)
@@ -125,7 +122,8 @@ def test_forty_steps_are_twenty_a_kill_and_twenty_more(
             trained(tmp_path / "cut", inputs, progress, **settings)
     assert not (tmp_path / "cut" / "field.json").exists()
     trained(tmp_path / "cut", inputs, progress, **settings)
-    assert "resuming from step 20 of 40" in progress.notes
+    (resumed,) = progress.said("train.resumes")
+    assert "20 of 40" in resumed
     for name in OUTPUTS:
         assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     final = "checkpoints/000000040.safetensors"  # the optimiser, too
@@ -146,7 +144,7 @@ def test_a_grid_field_that_diverges_is_rolled_back(tmp_path: Path, progress, mon
     result = trained(tmp_path / "train", inputs, progress, field="grid", steps=60)
     assert result.facts["rollbacks"] == 1
     assert "nonfinite_30.safetensors" in result.records
-    assert any("the loss of step 30 is not finite: back to step" in note for note in progress.notes)
+    assert "step 30" in progress.said("train.rolled-back")[0]
     assert 13 < result.facts["probe_psnr"] < 60
 
 
@@ -199,7 +197,7 @@ def test_test_photos_of_which_masks_leave_nothing_stop_no_training(tmp_path: Pat
     config = Config(downscale=2.0)
     assert held_out_evaluation(config, inputs["ingest"], masked, "test", "cpu", progress) is None
     why = "the masks ignore every pixel of the test photos at this size"
-    assert progress.notes == [f"test photos are not measured while training: {why}"]
+    assert progress.codes == ["train.no-test-photos"] and why in progress.notes[0]
     with refused("train.all-masked"):
         held_out_evaluation(config, inputs["ingest"], with_validation_split(masked), "validation", "cpu", progress)
 
@@ -264,7 +262,7 @@ def test_plan_answers_everything_for_the_grid_field(
     inputs, _ = photographed(tmp_path, bounded=bounded)
     planned = train.plan(Config(), inputs, progress)
     assert (planned.field, planned.seconds, planned.space) == ("grid", 180, "bounded" if bounded else "contracted")
-    assert any(note.startswith("180 s on this machine draw about ") for note in progress.notes)
+    assert "180 s" in progress.said("train.photo-size")[0]
     assert (planned.downscale, planned.background) == (1.0, "random")
     assert None not in planned.grid.model_dump().values()
     assert planned.learning_rate == LEARNING_RATES["bounded" if bounded else "contracted"]
