@@ -21,7 +21,7 @@ TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all of 
 # stages/train/fields/hash_grid.py. Over a run lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour
 # (docs/experiments/ray_samples.md).
 DENSITIES: dict[Space, int] = {"bounded": 7, "contracted": 24}
-WHERE = {"bounded": "around an object", "contracted": "in unbounded space"}
+WHERE: dict[Space, str] = {"bounded": "around an object", "contracted": "in unbounded space"}
 VANILLA_RAYS = {"vanilla NeRF as published": (8, 256, 64, 128), "vanilla NeRF 4 × 64": (4, 64, 32, 32)}
 
 

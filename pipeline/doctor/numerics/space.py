@@ -255,7 +255,7 @@ CASES = [
     ),
     Case(
         formula="normalised device coordinates (x/z, y/z, 1 − 2 n/z)",
-        where="nerf/geometry/space_maps.py: Ndc.forward, Ndc.pull_back",
+        where="nerf/geometry/space_maps.py: forward, pull_back",
         domain="all finite points",
         hazard="infinite at z = 0, folded back behind it",
         answer="z is n/1000 at least: what is before the near plane or behind the camera is far outside of the cube",
@@ -275,7 +275,7 @@ CASES = [
     ),
     Case(
         formula="their inverse, z = 2 n / (1 − z')",
-        where="nerf/geometry/space_maps.py: Ndc.inverse",
+        where="nerf/geometry/space_maps.py: inverse",
         domain="max abs y_i < 0.9",
         hazard="1 − z' cancels; infinite at the far face",
         answer="1 − z' of two float32 numbers is exact near the far face; callers stay half a cell within it",

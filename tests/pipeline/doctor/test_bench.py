@@ -17,8 +17,8 @@ from stages.train.fields.hash_grid import MICRO_BATCH_SAMPLES, SAMPLES_PER_RAY
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "SECONDS", 0.01)
-    monkeypatch.setattr(machine_rates, "STREAMED", 1 << 20)
-    monkeypatch.setattr(machine_rates, "MIN_STREAMED", 1 << 18)
+    monkeypatch.setattr(machine_rates, "STREAMED_FLOATS", 1 << 20)
+    monkeypatch.setattr(machine_rates, "MIN_STREAMED_FLOATS", 1 << 18)
     monkeypatch.setattr(doctor, "self_test", lambda device: [])
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from nerf.geometry.region_of_interest import CaptureType
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from nerf.geometry.space_maps import Box, Contraction, Ndc
 from nerf.training.ray_dataset import ray_dataset_from_images
@@ -23,7 +24,7 @@ SMALL = {
 }
 
 
-def scene_of(poses: np.ndarray, capture_type="forward-facing") -> Scene:
+def scene_of(poses: np.ndarray, capture_type: CaptureType = "forward-facing") -> Scene:
     views = tuple(
         View(f"{i}.jpg", f"{i}.jpg", 0, pose, 0.5, 20.0, "test" if i % 8 == 0 else "train")
         for i, pose in enumerate(poses)
@@ -97,7 +98,7 @@ def test_both_fields_train_in_ndc(field: str) -> None:
     if field == "grid":
         config = config.filled({"grid": {"backend": "torch"}})
     trainer = make_trainer(config, scene, dataset, 0)
-    errors = [trainer.step(step, step / 60).psnr for step in range(60)]
+    errors = [trainer.step(step, step / 60, 1.0).psnr for step in range(60)]
     assert isinstance(trainer.model.settings.space, Ndc)  # pyright: ignore
     assert errors[-1] > errors[0] + 3
 
