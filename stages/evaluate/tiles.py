@@ -4,12 +4,11 @@ Tiles cover the photo. A dither mask over them by the R2 sequence (Roberts 2018)
 and from photo to photo others, so that no part of the pictures counts more than another.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from torch import Tensor
+import torch
+from torch import Tensor
 
 # Pixels along an edge. Errors of neighbours are alike, so many small tiles tell more than a few large ones, of SSIM,
 # too, although a window takes 11 of them (docs/experiments/score_tiles.md).
@@ -27,25 +26,21 @@ class Tiles(NamedTuple):
     corners: np.ndarray
     size: tuple[int, int]
 
-    def cut(self, picture: "Tensor") -> "Tensor":
+    def cut(self, picture: Tensor) -> Tensor:
         """The tiles (n, rows, columns, …) of a picture (height, width, …)."""
-        import torch
-
         row, column = (torch.from_numpy(start)[:, None, None] for start in self.corners.T)
         rows, columns = (torch.arange(length) for length in self.size)
         return picture[row + rows[:, None], column + columns]
 
-    def mask(self, height: int, width: int) -> "Tensor":
+    def mask(self, height: int, width: int) -> Tensor:
         """Which pixels are in a tile, (height, width) bool."""
-        import torch
-
         inside = torch.zeros(height, width, dtype=torch.bool)
         for row, column in self.corners.tolist():
             inside[row : row + self.size[0], column : column + self.size[1]] = True
         return inside
 
 
-def tiles_of(height: int, width: int, fraction: float, number: int, used: "Tensor | None" = None) -> Tiles:
+def tiles_of(height: int, width: int, fraction: float, number: int, used: Tensor | None = None) -> Tiles:
     """The tiles that stand for a ``fraction`` of the ``number``-th photo, MIN_TILES at least where it has as many.
 
     ``used``, (height, width) bool, says which pixels count: tiles without any are not taken.
