@@ -290,7 +290,7 @@ CASES = [
     ),
     Case(
         formula="straight rays through them",
-        where="nerf/geometry/space_maps.py: Ndc.map_rays, MappedRays.from_scene",
+        where="nerf/geometry/space_maps.py: map_rays, from_scene",
         domain="rays that come before the near plane",
         hazard="the paper's z/(z + t) − 1 cancels far away; 0/0 for rays parallel to the image plane",
         answer="distances over depth, t / z(t): finite in every direction",
