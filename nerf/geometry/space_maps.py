@@ -30,6 +30,7 @@ SpaceName = Literal["box", "contraction", "ndc"]
 # far outside of the cube.
 MIN_DEPTH = 1e-3
 MAX_ANGLE_DEG = 75.0  # of a ray off the mean axis, for a pyramid to hold it; at 90 it would be as wide as space
+AXES_TOLERANCE = 1e-6  # axes were read from JSON with all digits; what is farther off is no rotation
 MIN_REST = 1e-6  # of a ray's depth at its start over that at a sample: no sample is mapped back to beyond 1e6 times it
 
 
@@ -140,7 +141,7 @@ class Ndc:
 
     def __post_init__(self) -> None:
         axes = np.array(self.axes)
-        if axes.shape != (3, 3) or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-6):
+        if axes.shape != (3, 3) or not np.allclose(axes @ axes.T, np.eye(3), atol=AXES_TOLERANCE):
             raise ValueError(f"the axes of the pyramid are {self.axes}; they must be three at right angles")
         if not (np.isfinite(self.apex).all() and all(0 < each < math.inf for each in (*self.slopes, self.near))):
             raise ValueError(

@@ -193,7 +193,7 @@ def test_damaged_optional_inputs_are_left_out_in_place(bring: Bring, tmp_path: P
     monkeypatch.setattr(
         train, "run", lambda config, inputs, *rest: seen.append({*inputs}) or whole(config, inputs, *rest)
     )
-    monkeypatch.setattr(SilentDisplay, "note", lambda _, message: notes.append(message))
+    monkeypatch.setattr(SilentDisplay, "note", lambda _, code, message: notes.append(message))
     bring(stages=("ingest", "sfm"))
     (folder,) = (tmp_path / "w.nerf/sfm").iterdir()
     flip(folder / "deep/number.json")

@@ -95,7 +95,7 @@ def test_without_a_budget_expected_stands_beside_spent(tmp_path: Path, progress:
     html, summary = written(inputs, tmp_path / "out", progress)
     assert summary["expected_seconds"] == {"sfm": 50.0, "train": 184.0}
     made = html.split("How it was made")[1]
-    assert "without a budget it is no promise" in made and '<th class="number">expected</th>' in made
+    assert "Without a budget it is an estimate only" in made and '<th class="number">expected</th>' in made
     rows = {row[0]: row[2:4] for row in ([re.sub("<[^>]+>", "", c) for c in re.findall("<td.*?</td>", line)]
             for line in re.findall("<tr>.*</tr>", made)) if len(row) == 5}  # fmt: skip
     assert rows["sfm"] == ["50 s", "58 s"] and rows["train"] == ["3 min 4 s", "3 min 2 s"] and rows["mesh"][0] == "–"
