@@ -26,6 +26,7 @@ from nerf.runtime.parallel import take_over_cores, workers
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from nerf.training.metrics import psnr
 from nerf.training.ray_dataset import RayDataset
+from pipeline.engine.display import SilentDisplay
 from stages.effects.decisions import Space
 from stages.hardware.backend import load_backend
 from stages.io.files import read_json, read_scene
@@ -46,14 +47,6 @@ SPACES: dict[str, Space] = {"box": "bounded", "contraction": "contracted", "ndc"
 BLACK = (0.0, 0.0, 0.0)
 STEPS_ACROSS = 1536  # of contracted space, as stage train has them
 RECORDED = (1 / 8, 1 / 4, 1 / 2, 1)  # shares of a run at which it is scored
-
-
-class Quiet:
-    """Says nothing."""
-
-    def update(self, message: str, done: float | None = None) -> None: ...
-
-    def note(self, code: str, text: str) -> None: ...
 
 
 def variants(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -179,7 +172,10 @@ def main() -> None:
     keys = read_json(given.workspace / "run.json")["keys"]
     inputs = {stage: given.workspace / stage / keys[stage][:16] for stage in ("ingest", "normalise")}
     scene = read_scene(inputs["normalise"])
-    data = guided_dataset(inputs, scene, 1.0, Quiet()), training_dataset(inputs["ingest"], scene, "test", 1.0, Quiet())
+    data = (
+        guided_dataset(inputs, scene, 1.0, SilentDisplay()),
+        training_dataset(inputs["ingest"], scene, "test", 1.0, SilentDisplay()),
+    )
     dataset, test = (each.to(given.device) for each in data)
     ndc, record = enclosing_pyramid(scene), Record(given.out)
     print(ndc)

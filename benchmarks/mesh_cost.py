@@ -23,6 +23,7 @@ from benchmarks.record import Record, add_out
 from nerf import REGION_HALF_SIZE
 from nerf.geometry.scene import Scene
 from pipeline.demo.truth import Truth, compare_with_truth
+from pipeline.engine.display import SilentDisplay
 from pipeline.engine.workspace import Workspace
 from stages.contract import Inputs
 from stages.mesh import Config
@@ -31,16 +32,6 @@ from stages.mesh.files import ColouredMesh
 from stages.mesh.surface import sample_surface
 
 SAMPLES = 200_000  # of the mesh
-
-
-class Quiet:
-    """A Progress that says nothing."""
-
-    def update(self, message: str, done: float | None = None) -> None:
-        """Nothing."""
-
-    def note(self, code: str, text: str) -> None:
-        """Nothing."""
 
 
 def to_truth(mesh: "ColouredMesh", scene: "Scene", normalise: Path, truth: Truth) -> dict[str, float]:
@@ -63,9 +54,9 @@ def to_points(mesh: "ColouredMesh", points: np.ndarray) -> dict[str, float]:
 
 def figures(folders: Inputs, resolution: int, truth: Truth | None) -> dict[str, Any]:
     """One resolution's row of the table."""
-    source = load(folders, Quiet())
+    source = load(folders, SilentDisplay())
     started = time.perf_counter()
-    made = extract_mesh(Config(resolution=resolution), source, Quiet())
+    made = extract_mesh(Config(resolution=resolution), source, SilentDisplay())
     seconds = time.perf_counter() - started
     if truth is None:
         known = to_points(made.mesh, source.points)

@@ -150,10 +150,8 @@ class Ndc:
 
     def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         """Of scene points; those before the near plane, or behind the apex, are far outside of the cube."""
-        x, y, z = self._local(points).unbind(-1)
-        inverse = 1 / z.clamp(min=MIN_DEPTH * self.near)
-        sideways = (each * inverse * (self.half / slope) for each, slope in zip((x, y), self.slopes, strict=True))
-        return torch.stack([*sideways, self.half * (1 - 2 * self.near * inverse)], -1)
+        local = self._local(points)
+        return self._projected(local[..., :2], local[..., 2].clamp(min=MIN_DEPTH * self.near))
 
     def inverse(self, mapped: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         """The scene points again, within the open cube; on its far face they are at infinity."""
@@ -198,8 +196,7 @@ class Ndc:
         seen = (start < far) & (depth >= self.near)
         depth = depth.clamp(min=self.near)
         at = self._projected(at_start[..., :2], depth)
-        scale = rays.origins.new_tensor([self.half / each for each in self.slopes])
-        towards = directions[..., :2] * scale - at[..., :2] * slope[..., None]
+        towards = directions[..., :2] * self._scale(rays.origins) - at[..., :2] * slope[..., None]
         velocity = torch.cat([towards, ((self.half - at[..., 2]) * slope)[..., None]], -1)
         speed = velocity.norm(dim=-1)
         line = Line(torch.where(seen, start, rays.far), depth, slope, speed)
@@ -209,10 +206,12 @@ class Ndc:
     def _projected(
         self, sideways: Float[Tensor, "*points 2"], depth: Float[Tensor, "*points"]
     ) -> Float[Tensor, "*points 3"]:
-        scale = sideways.new_tensor([self.half / each for each in self.slopes])
-        return torch.cat(
-            [sideways * scale / depth[..., None], (self.half * (1 - 2 * self.near / depth))[..., None]], -1
-        )
+        """Points in the cube of those in the camera frame of the apex, by their x, y and positive depth."""
+        forward = self.half * (1 - 2 * self.near / depth)
+        return torch.cat([sideways * self._scale(sideways) / depth[..., None], forward[..., None]], -1)
+
+    def _scale(self, like: Tensor) -> Float[Tensor, "2"]:
+        return like.new_tensor([self.half / each for each in self.slopes])
 
     def _matrix(self, like: Tensor) -> Float[Tensor, "3 3"]:
         return like.new_tensor(self.axes)
