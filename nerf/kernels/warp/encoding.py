@@ -120,6 +120,17 @@ def _corner_shares(u: float, v: float, w: float):
     return vec8(a * t, a * w, b * t, b * w, c * t, c * w, d * t, d * w)
 
 
+@wp.func
+def _around(level: wp.vec4i, point: wp.vec3):
+    """The cell of a point, table rows of its corners and their trilinear weights."""
+    scaled = float(level[0]) * point
+    x = _cell(scaled[0], level[0])
+    y = _cell(scaled[1], level[0])
+    z = _cell(scaled[2], level[0])
+    shares = _corner_shares(scaled[0] - float(x), scaled[1] - float(y), scaled[2] - float(z))
+    return wp.vec3i(x, y, z), _corner_rows(level, x, y, z), shares
+
+
 # In C++, since sums of share * row with wp.vec4 compile to two loads, products and sums per corner (Warp 1.19, x86).
 @wp.func_native("""
     float mean[4] = {0.0f};
@@ -178,12 +189,7 @@ def _encode(
     for index in range(count):
         level = levels[index]
         _prefetch_around(table, level, later)
-        scaled = float(level[0]) * point
-        x = _cell(scaled[0], level[0])
-        y = _cell(scaled[1], level[0])
-        z = _cell(scaled[2], level[0])
-        rows = _corner_rows(level, x, y, z)
-        shares = _corner_shares(scaled[0] - float(x), scaled[1] - float(y), scaled[2] - float(z))
+        _, rows, shares = _around(level, point)
         _interpolate(table, rows, shares, features, i * count + index)
 
 
@@ -198,12 +204,8 @@ def _encode_lanes(
     """A thread per level of a point: on a GPU neighbouring threads should touch neighbouring memory."""
     i = wp.tid()
     level = levels[i % count]
-    scaled = float(level[0]) * points[i / count]
-    x = _cell(scaled[0], level[0])
-    y = _cell(scaled[1], level[0])
-    z = _cell(scaled[2], level[0])
-    shares = _corner_shares(scaled[0] - float(x), scaled[1] - float(y), scaled[2] - float(z))
-    _interpolate(table, _corner_rows(level, x, y, z), shares, features, i)
+    _, rows, shares = _around(level, points[i / count])
+    _interpolate(table, rows, shares, features, i)
 
 
 @wp.kernel
@@ -218,12 +220,7 @@ def _encode_backward_table(
     i = wp.tid()
     level = levels[index]
     _prefetch_around(grad_table, level, _ahead(points, i))
-    scaled = float(level[0]) * points[i]
-    x = _cell(scaled[0], level[0])
-    y = _cell(scaled[1], level[0])
-    z = _cell(scaled[2], level[0])
-    rows = _corner_rows(level, x, y, z)
-    shares = _corner_shares(scaled[0] - float(x), scaled[1] - float(y), scaled[2] - float(z))
+    _, rows, shares = _around(level, points[i])
     grad = grad_features[i * count + index]
     for corner in range(8):
         wp.atomic_add(grad_table, rows[corner], shares[corner] * grad)
@@ -298,12 +295,8 @@ def _encode_backward_table_lanes(
     i = wp.tid() % number
     index = first + wp.tid() / number
     level = levels[index]
-    scaled = float(level[0]) * points[i]
-    x = _cell(scaled[0], level[0])
-    y = _cell(scaled[1], level[0])
-    z = _cell(scaled[2], level[0])
-    shares = _corner_shares(scaled[0] - float(x), scaled[1] - float(y), scaled[2] - float(z))
-    _add_to_rows(grad_table, _corner_rows(level, x, y, z), shares, grad_features[i * count + index], index, x, y, z)
+    cell, rows, shares = _around(level, points[i])
+    _add_to_rows(grad_table, rows, shares, grad_features[i * count + index], index, cell[0], cell[1], cell[2])
 
 
 @wp.kernel
