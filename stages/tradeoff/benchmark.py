@@ -97,20 +97,23 @@ def make_benchmark(ingest: Path, scene: Scene, downscale: float | None, count: i
     NUM_SHOWN of these photos at 1/``small``, large ones still smaller: at most SMALL_SIDE pixels, which the study has
     time to render."""
     test, background = scene.of_split("test"), WHITE if scene.has_alpha else BLACK
-    whole = (_photo(ingest, scene, view, downscale, background) for view in test)
+    reader = PhotoReader(ingest, scene, downscale)
+    whole = (_photo(reader, view, background) for view in test)
     parts = (photo.tiled(math.ceil(count / len(test)), number) for number, photo in enumerate(whole))
     crops = tuple(part for part in parts if part is not None)
     _check_masks(crops)
     shown = [test[i] for i in spread(len(test), min(NUM_SHOWN, len(test)))]
     sides = [max(camera.width, camera.height) for camera in (scene.cameras[view.camera] for view in shown)]
     sizes = [max(small, side / SMALL_SIDE) for side in sides]
-    photos = tuple(_photo(ingest, scene, *each, background) for each in zip(shown, sizes, strict=True))
+    readers = (PhotoReader(ingest, scene, size) for size in sizes)
+    photos = tuple(_photo(*each, background) for each in zip(readers, shown, strict=True))
     return Benchmark(scene, crops, photos, scaled_size(scene.cameras[test[0].camera], downscale), background)
 
 
-def _photo(ingest: Path, scene: Scene, view: View, downscale: float | None, background: Colour) -> Crop:
-    truth = PhotoReader(ingest, scene, downscale).pixels(view, background)
-    return Crop(view.name, view_rays(scene, view, downscale), truth, view_mask(ingest, scene, view, downscale))
+def _photo(reader: PhotoReader, view: View, background: Colour) -> Crop:
+    ingest, scene, downscale = reader.ingest, reader.scene, reader.downscale
+    truth, mask = reader.pixels(view, background), view_mask(ingest, scene, view, downscale)
+    return Crop(view.name, view_rays(scene, view, downscale), truth, mask)
 
 
 def _check_masks(crops: tuple[Crop, ...]) -> None:
