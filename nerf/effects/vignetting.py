@@ -40,7 +40,7 @@ class VignettingModel:
     name: ClassVar = "vignetting"
     learning_rate: ClassVar = LEARNING_RATE
     row_length: ClassVar = 1 + TERMS
-    held_out_words: ClassVar = "as dark at the corners as their camera makes them"
+    held_out_words: ClassVar = "as dark at the corners as its camera makes it"
 
     def __init__(
         self, images: Images, falloff: Float[Tensor, "cameras 3"], mean_log_gain: Float[Tensor, "cameras 1"]

@@ -1,6 +1,7 @@
 """Whether photos are darker towards their corners: what gains leave, against the square of the radius."""
 
 import numpy as np
+from jaxtyping import Float
 
 from nerf.effects.statistics.exposure import EV, ExposureFit
 from nerf.effects.statistics.statistic import MIN_EFFECT, VALUE_PER_LOG_LIGHT, Evidence, classify, unknown
@@ -32,3 +33,10 @@ def vignetting_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence:
         return unknown("EV", THRESHOLD_EV, "every point lies at one radius in all photos", False)
     words = f"corners are {abs(slope):.2g} EV {'darker' if slope < 0 else 'brighter'} than the middle, ± {noise:.1g}"
     return classify(-slope, noise, THRESHOLD_EV, "EV", words)
+
+
+def log_falloff(u: Float[np.ndarray, "*n"], falloff: Float[np.ndarray, "3"]) -> Float[np.ndarray, "*n"]:
+    """p(u) of nerf/effects/vignetting.py: 0 at the axis, the sum of the coefficients at the corner, where u is 1;
+    √u is nearly the distance from the axis in the image."""
+    first, second, third = falloff
+    return first * (1 - (1 - u) ** 3) + second * (3 * u**2 - 2 * u**3) + third * u**3

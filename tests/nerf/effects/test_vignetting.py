@@ -2,17 +2,21 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from nerf.effects import ColourEffect, HeldOutImages, ImageEffects, Images, RenderedRays
 from nerf.effects.exposure import expose
-from nerf.effects.vignetting import MEAN_TERMS, UNKNOWN_CORNER, VignettingModel
+from nerf.effects.statistics.vignetting import log_falloff
+from nerf.effects.vignetting import MEAN_TERMS, UNKNOWN_CORNER, VignettingModel, falloff_terms
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 
 CORNER = 30.0  # degrees from the axis
+CORNER_U = math.sin(math.radians(CORNER) / 2) ** 2
+PER_CORNER = torch.full((21, 1), 1 / (4 * CORNER_U)).double()
 FALLOFF = torch.tensor([[0.3, 0.2, 0.1], [0.0, 0.0, 0.7]], dtype=torch.float64)
 ROWS = torch.cat([torch.full((2, 1), 0.7).double(), FALLOFF], dim=1)
 VIEW = torch.tensor([0, 2, 1, 0, 1])
@@ -56,6 +60,15 @@ def test_light_falls_from_the_axis_to_the_corner(camera: int) -> None:
     at_corner = float(0.7 - FALLOFF[camera].sum())
     torch.testing.assert_close(shown[30], expose(grey(1)[0], torch.full((3,), at_corner).double()))
     assert (shown[31:] == shown[31]).all(), "what no pixel sees is as dark as the corner"
+
+
+def test_the_curve_that_is_drawn_is_that_which_is_learnt() -> None:
+    u = torch.linspace(0, 1, 21).double()
+    directions = torch.stack([(u * (1 - u * CORNER_U)).sqrt(), 0 * u, 1 - 2 * u * CORNER_U], dim=1)
+    directions[:, 0] *= 2 * math.sqrt(CORNER_U)
+    learnt = falloff_terms(directions, torch.tensor([[0.0, 0, 1]]).double().expand(21, 3), PER_CORNER) @ FALLOFF[0]
+    np.testing.assert_allclose(log_falloff(u.numpy(), FALLOFF[0].numpy()), learnt.numpy(), atol=1e-12)
+    assert 0 == float(learnt[0]) < float(learnt[-1])
 
 
 def test_gradients_by_hand_are_the_derivative() -> None:

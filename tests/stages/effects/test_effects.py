@@ -112,7 +112,7 @@ def test_view_dependence_is_left_out_only_where_that_gains(
 
 
 @pytest.mark.parametrize("name", ["exposure", "vignetting"])
-def test_what_was_measured_goes_to_training_by_the_names_of_its_photos(decided: Callable, name: str) -> None:
+def test_what_was_measured_goes_to_training_by_photo(decided: Callable, name: str) -> None:
     decisions, *_ = decided(effects.Config(), **{name: found(True)})
     assert set(decisions.on[name]) == {f"{i}.png" for i in (1, 2, 3, 5, 6, 7, 9, 10)}
     assert all(numbers == [0.5] * 3 for numbers in decisions.on[name].values())
