@@ -189,6 +189,8 @@ def test_a_transforms_file_that_was_written_on_windows(tmp_path: Path) -> None:
     cameras.write_bytes(b"\xef\xbb\xbf" + cameras.read_bytes())
     photos = ["train/0001.png", "train/0002.png", "train\\0002.png", "gone\\0.png"]
     assert list(find_source(cameras).frames.values()) == photos
+    cameras.write_text(cameras.read_text("utf-8-sig"), "utf-16")  # as PowerShell redirects
+    assert list(find_source(cameras).frames.values()) == photos
     error = refusal(transforms(tmp_path / "transforms.json", "..\\secret.jpg"))
     assert (error.what, error.why) == ("rejected the photo '../secret.jpg'", f"it leads out of the folder {tmp_path}")
 
