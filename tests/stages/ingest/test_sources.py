@@ -212,8 +212,13 @@ def test_frames_may_not_leave_their_folder(tmp_path: Path, file_path: str) -> No
         ("{", "it is not JSON"),
         ("[1]", "it has no list named 'frames'"),
         ('{"frames": []}', "its list 'frames' is empty"),
-        ('{"frames": [{"file_path": "a.jpg"}]}', "frame 0 lacks file_path or transform_matrix"),
-        ('{"frames": [{"file_path": 3, "transform_matrix": []}]}', "frame 0 lacks file_path or transform_matrix"),
+        ('{"frames": [{"file_path": "a.jpg"}]}', "frame 0 has no transform_matrix: it has file_path"),
+        ('{"frames": [{"path": 1, "c2w": 2}]}', "frame 0 has no file_path and no transform_matrix: it has path, c2w"),
+        (
+            '{"frames": [{"file_path": 3, "transform_matrix": []}]}',
+            "the file_path of frame 0 is 3, and no name of a file",
+        ),
+        ('{"frames": ["a.jpg"]}', "frame 0 is 'a.jpg', and no object with file_path and transform_matrix"),
         ("[" * 100_000, "it is not JSON"),
     ],
 )
