@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.record import Record, add_out
 from stages import effects
+from stages.contract import run_stage
 from stages.effects.decisions import Decisions, read_decisions
 from stages.effects.pilots import pilot_scene, run_pilot
 from stages.io.files import read_scene
@@ -78,7 +79,7 @@ def decide(folder: Path, made: Effects, seed: int) -> Outcome:
     """Make the photos and run the stage on them."""
     inputs, out = effect_scene(folder / "scene", made, seed), folder / "effects"
     out.mkdir()
-    effects.run(effects.Config(seed=seed), inputs, out, Quiet())
+    run_stage(effects, effects.Config(seed=seed), inputs, out, Quiet())
     return Outcome(read_decisions(out), json.loads((out / "effects.json").read_text("utf-8")), inputs, made)
 
 

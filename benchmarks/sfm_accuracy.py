@@ -34,6 +34,7 @@ import numpy as np
 from benchmarks.record import Record, add_out
 from nerf.geometry.alignment import align
 from stages import ingest, sfm
+from stages.contract import run_stage
 from stages.io.photos import Photo, read_photos
 from stages.io.sparse_model import SparseModel
 from stages.sfm.colmap.models import read_model
@@ -90,7 +91,7 @@ def measure(data: Path, config: sfm.Config) -> dict[str, Any]:
         photos = data / "images" if transforms.exists() else data
         ingest.run(ingest.Config(photos=photos), {}, folders["ingest"], Quiet())
         begin = time.perf_counter()
-        result = sfm.run(config, folders, folders["sfm"], Quiet())
+        result = run_stage(sfm, config, folders, folders["sfm"], Quiet())
         seconds = time.perf_counter() - begin
         model = read_model(folders["sfm"] / "sparse")
         if transforms.exists():

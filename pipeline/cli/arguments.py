@@ -2,9 +2,9 @@
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import redirect_stderr, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from pipeline.cli.options import UsageError, wrong_options
 from pipeline.engine.settings import Settings
+from pipeline.engine.stage_list import STAGES
 from stages.render import Config as RenderConfig
 from stages.train.config import FIELD_NAMES, PRESET_FIELDS
 from stages.train.config import Config as TrainConfig
@@ -167,18 +168,13 @@ COMMANDS: dict[str, type] = {
 }
 
 
-def parse(kind: type[T], command: str, words: Sequence[str], settings: Settings | None = None) -> T:
-    """Parse ``words``; stage options not named in them keep their value in ``settings``.
+def parse(kind: type[T], command: str, words: Sequence[str]) -> T:
+    """Parse ``words``; options of stages that they do not name have their defaults.
 
     Raises UsageError with every wrong word in a sentence of its own, SystemExit(0) after ``--help``.
     """
-    if settings is not None:
-        left = {"train": _without_replaced(settings.train, words), "render": _one_path(settings.render, command, words)}
-        settings = settings.model_copy(update=left)
     positional = {name: tyro.MISSING for name in ("photos", "workspace", "stage") if name in kind.__annotations__}
     default: Any = kind(**positional)
-    if settings is not None:
-        default = replace(default, settings=settings)
     said = io.StringIO()
     try:
         with redirect_stderr(said):
@@ -189,6 +185,38 @@ def parse(kind: type[T], command: str, words: Sequence[str], settings: Settings 
         if "photos" in positional and (surplus := _surplus_file(kind, words, default)):
             raise UsageError(f"{surplus} is one file too many; give the folder that holds the photos") from ending
         raise UsageError(f"{_what_is_wrong(ending, said.getvalue())} (pipeline {command} --help)") from ending
+
+
+def with_flags(settings: Settings, parsed: Settings, command: str, words: Sequence[str]) -> Settings:
+    """``settings`` (recorded, or from a file) with the options of stages that ``words`` name, as :func:`parse` read
+    them, and without those that these replace. Raises UsageError where they do not go together."""
+    left = {"train": _without_replaced(settings.train, words), "render": _one_path(settings.render, command, words)}
+    settings = settings.model_copy(update=left)
+    named = {(stage, name) for stage in STAGES for name in _named_options(stage, words)}
+    for stage in {stage for stage, _ in named}:
+        values = getattr(settings, stage).model_dump()
+        for name in (name for of, name in named if of == stage):
+            *parents, option = name.split(".")
+            table, given = values, getattr(parsed, stage)
+            for parent in parents:
+                table, given = table.setdefault(parent, {}), getattr(given, parent)
+            table[option] = getattr(given, option)
+        try:
+            settings = settings.model_copy(update={stage: STAGES[stage].Config.model_validate(values)})
+        except ValidationError as error:
+            raise UsageError(f"{wrong_options(error, f'--{stage}')} (pipeline {command} --help)") from error
+    return settings
+
+
+def _named_options(stage: str, words: Sequence[str]) -> Iterator[str]:
+    """The dotted names of the stage's options that ``words`` give, which may be spelt with underscores."""
+    flags = {word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")}
+    for name, option in STAGES[stage].Config.flags():
+        *parents, last = f"{stage}.{name}".replace("_", "-").split(".")
+        own = [".".join([*parents, last]), ".".join([*parents, f"no-{last}"])]
+        aliases = [alias for entry in option.metadata for alias in getattr(entry, "aliases", None) or ()]
+        if not flags.isdisjoint([*(f"--{flag}" for flag in own), *aliases]):
+            yield name
 
 
 def _surplus_file(kind: type, words: Sequence[str], default: Any) -> str | None:

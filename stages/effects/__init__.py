@@ -116,4 +116,4 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     from stages.effects.study import study
 
     scene, registration = read_scene(inputs["normalise"]), read_json(inputs["sfm"] / "registration.json")
-    return study(plan(config, inputs, progress), scene, registration, inputs, folder, progress)
+    return study(config, scene, registration, inputs, folder, progress)

@@ -74,7 +74,6 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """Render the test photos, compare, and write metrics.json, renders/ and errors/."""
     from stages.evaluate.scoring import load, save, score
 
-    config = plan(config, inputs, progress)
     scorer = load(config, inputs, progress)
     images = score(scorer, folder, progress)
     return save(scorer, images, folder)

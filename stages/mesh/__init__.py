@@ -71,7 +71,6 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """Extract the mesh; write it in every format asked for, and a picture of it."""
     from stages.mesh.extraction import extract_mesh, load, save
 
-    config = plan(config, inputs, progress)
     source = load(inputs, progress)
     extracted = extract_mesh(config, source, progress)
     progress.update("writing", 0.95)

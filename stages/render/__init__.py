@@ -93,8 +93,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     from stages.render import video
     from stages.render.renderer import load_renderer
 
-    config = plan(config, inputs, progress)
-    assert config.width is not None and config.fps is not None
+    assert config.width is not None and config.fps is not None, "plan() chooses them"
     scene = read_scene(inputs["normalise"])
     renderer = load_renderer(inputs["train"], progress=progress)
     renderer, appearance = video.with_appearance(renderer, config.match_exposure, inputs["train"], scene, progress)

@@ -142,7 +142,6 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """Write ``sparse/`` and registration.json. Raises StageError where no usable model comes out."""
     from stages.sfm import reconstruction
 
-    config = plan(config, inputs, progress)
     folder.mkdir(parents=True, exist_ok=True)
     registration, skipped = reconstruction.find_cameras(config, inputs["ingest"], folder, progress)
     write_json(folder / "registration.json", registration)

@@ -62,6 +62,5 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """Train and score run by run, then write tables, plot, pictures and the recommendation."""
     from stages.tradeoff.study import run_study, save_study
 
-    config = config if config.speeds else plan(config, inputs, progress)
     outcome = run_study(config, inputs, folder, progress)
     return save_study(config, outcome, folder, workspace=inputs["normalise"].resolve().parents[1].name)

@@ -11,6 +11,7 @@ from nerf.training.trainer import NonFinite
 from pipeline.engine import manifests
 from pipeline.engine.keys import stage_key
 from stages import effects, train
+from stages.contract import run_stage
 from stages.effects import pilots, study
 from stages.effects.decisions import Decisions, read_decisions, write_decisions
 from stages.effects.pilots import Pilot
@@ -55,7 +56,7 @@ def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
         monkeypatch.setattr(pilots, "run_pilot", pilot or run_pilot)
         folder = tmp_path / f"effects{len(list(tmp_path.iterdir()))}"
         folder.mkdir()
-        result = effects.run(config, inputs, folder, Quiet())
+        result = run_stage(effects, config, inputs, folder, Quiet())
         table = json.loads((folder / "effects.json").read_text("utf-8"))
         return read_decisions(folder), table, result.line, tried
 
@@ -191,7 +192,7 @@ def test_real_evidence_of_a_synthetic_scene(tmp_path: Path, made: Effects, on: s
     inputs = effect_scene(tmp_path / "scene", made)
     folder = tmp_path / "effects"
     folder.mkdir()
-    effects.run(effects.Config(pilot_steps=0), inputs, folder, Quiet())
+    run_stage(effects, effects.Config(pilot_steps=0), inputs, folder, Quiet())
     table = json.loads((folder / "effects.json").read_text("utf-8"))
     found = {name for name, entry in table.items() if entry["on"] and entry["modelled"]}
     assert found == on
