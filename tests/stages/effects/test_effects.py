@@ -9,6 +9,7 @@ import pytest
 from nerf.effects.statistics.statistic import Evidence
 from nerf.training.trainer import NonFinite
 from pipeline.engine import manifests
+from pipeline.engine.display import SilentDisplay
 from pipeline.engine.keys import stage_key
 from stages import effects, train
 from stages.contract import run_stage
@@ -19,7 +20,6 @@ from stages.effects.study import SceneEvidence
 from stages.io.files import write_json
 from tests.effect_scenes import Effects, effect_scene
 from tests.stages.photo_scene import photographed
-from tests.synthetic_photos import Quiet
 
 CLEAR = {"exposure": False, "view_dependence": True, "background": True, "pose_refinement": False, "vignetting": True}
 
@@ -56,7 +56,7 @@ def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
         monkeypatch.setattr(pilots, "run_pilot", pilot or run_pilot)
         folder = tmp_path / f"effects{len(list(tmp_path.iterdir()))}"
         folder.mkdir()
-        result = run_stage(effects, config, inputs, folder, Quiet())
+        result = run_stage(effects, config, inputs, folder, SilentDisplay())
         table = json.loads((folder / "effects.json").read_text("utf-8"))
         return read_decisions(folder), table, result.line, tried
 
@@ -192,7 +192,7 @@ def test_real_evidence_of_a_synthetic_scene(tmp_path: Path, made: Effects, on: s
     inputs = effect_scene(tmp_path / "scene", made)
     folder = tmp_path / "effects"
     folder.mkdir()
-    run_stage(effects, effects.Config(pilot_steps=0), inputs, folder, Quiet())
+    run_stage(effects, effects.Config(pilot_steps=0), inputs, folder, SilentDisplay())
     table = json.loads((folder / "effects.json").read_text("utf-8"))
     found = {name for name, entry in table.items() if entry["on"] and entry["modelled"]}
     assert found == on

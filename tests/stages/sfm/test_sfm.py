@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 from nerf.geometry.alignment import align
+from pipeline.engine.display import SilentDisplay
 from stages import ingest, sfm
 from stages.contract import StageError, run_stage
 from stages.io.files import read_json, write_png
@@ -26,7 +27,7 @@ from stages.sfm.retry_strategies import STRATEGIES, Outcome, StrategyLog
 from tests.blots import blots
 from tests.small_scenes import write_blender_scene
 from tests.stages.sfm.sfm_inputs import SMALL, ingested
-from tests.synthetic_photos import Quiet, SyntheticPhotos
+from tests.synthetic_photos import SyntheticPhotos
 
 ROOT = Path(__file__).parents[3]
 
@@ -35,7 +36,7 @@ ROOT = Path(__file__).parents[3]
 def inputs(synthetic_photos: SyntheticPhotos, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The synthetic photos after ingest."""
     folder = tmp_path_factory.mktemp("ingest")
-    ingest.run(ingest.Config(photos=synthetic_photos.folder), {}, folder, Quiet())
+    ingest.run(ingest.Config(photos=synthetic_photos.folder), {}, folder, SilentDisplay())
     return {"ingest": folder}
 
 
@@ -43,7 +44,7 @@ def inputs(synthetic_photos: SyntheticPhotos, tmp_path_factory: pytest.TempPathF
 def reconstructed(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a finished run on the synthetic photos."""
     folder = tmp_path_factory.mktemp("sfm")
-    run_stage(sfm, SMALL, inputs, folder, Quiet())
+    run_stage(sfm, SMALL, inputs, folder, SilentDisplay())
     return folder
 
 
@@ -85,8 +86,8 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from stages import sfm
-from tests.synthetic_photos import Quiet
-run_stage(sfm, sfm.Config(max_features=1000), {"ingest": Path(sys.argv[1])}, Path(sys.argv[2]), Quiet())
+from pipeline.engine.display import SilentDisplay
+run_stage(sfm, sfm.Config(max_features=1000), {"ingest": Path(sys.argv[1])}, Path(sys.argv[2]), SilentDisplay())
 """
 
 
