@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from pipeline.doctor.numerics.matrix import Row, figure, limit
+from tests.numerics.descriptions import DESCRIPTIONS
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "NUMERICS.md"
 
@@ -124,8 +125,8 @@ def document(rows: Iterable[Row]) -> str:
 
 def _cells(row: Row) -> list[str]:
     case, backends = row.case, row.measured.values()
-    tried = f"{case.tried} ({next(iter(backends)).rows})"
-    words = case.formula, f"`{case.where}`", case.domain, case.hazard, case.answer, tried
+    domain, hazard, answer, tried = DESCRIPTIONS[case.formula]
+    words = case.formula, f"`{case.where}`", domain, hazard, answer, f"{tried} ({next(iter(backends)).rows})"
     values = " / ".join(figure(measured.value) for measured in backends)
     gradients = " / ".join(figure(measured.gradient) for measured in backends)
     return [
