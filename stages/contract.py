@@ -40,9 +40,12 @@ from typing import Annotated, Any, NamedTuple, Protocol, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 from pydantic.fields import FieldInfo
-from tyro.conf import Suppress
+from tyro.conf import Suppress, arg
 
 MAX_LETTERS = 600  # of each part of an error
+T = TypeVar("T")
+# An option that is chosen for the user where it is None. Its help text says how, in the place of "(default: None)".
+Auto = Annotated[T | None, arg(help_behavior_hint="")]
 KEY_LENGTH = 16  # hex digits of a key that name a stage's folder: 64 bits
 
 

@@ -448,3 +448,4 @@ def test_options_are_documented():
     options = [(f"{stage}.{name}", option) for stage in STAGES for name, option in STAGES[stage].Config.flags()]
     assert "train.grid.max_res" in dict(options)
     assert [name for name, option in options if not option.description] == []
+    assert [name for name, option in options if option.default is None and "default: " not in option.description] == []
