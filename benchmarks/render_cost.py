@@ -21,8 +21,8 @@ from nerf.fields.interface import RadianceModel
 from nerf.fields.vanilla import VanillaNerf
 from nerf.training.metrics import mean_squared_error, psnr
 from pipeline.engine.workspace import Workspace
-from stages.amounts import resolution_name
 from stages.effects.image_effects import photo_effects
+from stages.io.amounts import resolution_name
 from stages.io.files import read_json, read_scene
 from stages.io.photos import spread
 from stages.render.renderer import Renderer, load_renderer

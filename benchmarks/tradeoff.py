@@ -18,7 +18,7 @@ from pipeline.engine.runner import Runner
 from pipeline.engine.settings import Settings
 from pipeline.engine.stage_list import needed_for
 from pipeline.engine.workspace import Workspace
-from stages.amounts import resolution_name
+from stages.io.amounts import resolution_name
 from stages.io.files import read_json
 from stages.tradeoff import Config
 

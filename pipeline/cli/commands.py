@@ -33,8 +33,8 @@ from pipeline.engine.failures import StageFailed
 from pipeline.engine.runner import Runner
 from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace
-from stages.amounts import duration
 from stages.contract import StageError
+from stages.io.amounts import duration
 
 REPORT_IT = "Finished stages are kept. Please report it with the output of the same command and --debug."
 

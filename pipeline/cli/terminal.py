@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from pipeline.engine.display import Display
-from stages.amounts import duration
 from stages.contract import StageError
+from stages.io.amounts import duration
 
 JSON_SECONDS = 0.2  # JSON output: one progress event at most this often
 HEARTBEAT_SECONDS = 10.0  # plain output: one line at most this often, so that a log stays readable

@@ -9,9 +9,9 @@ from nerf.kernels import torch as reference
 from nerf.runtime.machine_rates import Rates, copied_bytes, measure_copy, measure_gather, measure_matmul
 from nerf.runtime.profiler import WorkCounts
 from nerf.training.hash_grid_trainer import ADAM_BYTES
-from stages.amounts import bytes_in_words, short_count
 from stages.effects.decisions import Space
 from stages.hardware.device import compute_device, cores
+from stages.io.amounts import bytes_in_words, short_count
 from stages.train.config import Config
 from stages.train.fields.hash_grid import SAMPLES_PER_RAY, field_settings, rays_per_step, timed, with_defaults
 

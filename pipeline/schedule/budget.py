@@ -11,8 +11,8 @@ from types import ModuleType
 
 from pydantic import BaseModel, ConfigDict
 
-from stages.amounts import duration
 from stages.contract import BudgetLeft, Flexible, declared
+from stages.io.amounts import duration
 from stages.io.stopwatch import elapsed
 
 RUNNING = ".alive"  # in the workspace: what the running stage has cost so far (stages/io/stopwatch.py)

@@ -5,9 +5,9 @@ from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 from pipeline.schedule.budget import Stages, Times, max_total, min_total
-from stages.amounts import duration, rough_duration
 from stages.contract import BudgetLeft, Photos, StageConfig, StageError, Workload, declared
 from stages.ingest.sources import find_source
+from stages.io.amounts import duration, rough_duration
 
 if TYPE_CHECKING:
     from stages.ingest import Config as IngestConfig

@@ -7,7 +7,6 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator
 from tyro.conf import Suppress
 
-from stages.amounts import duration
 from stages.contract import (
     Auto,
     BudgetLeft,
@@ -18,6 +17,7 @@ from stages.contract import (
     Workload,
 )
 from stages.effects.effect_list import EFFECTS
+from stages.io.amounts import duration
 from stages.io.files import read_json, read_scene
 
 INPUTS = ("ingest", "sfm", "normalise")

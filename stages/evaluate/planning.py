@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 
 from nerf.geometry.rays import Rays, join_rays
 from nerf.geometry.scene import Scene
-from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress
 from stages.evaluate.scoring import fits_poses
 from stages.evaluate.seconds import MIN_RENDERING, SHARE, other_seconds
 from stages.evaluate.tiles import PREVIEW_SHARE
 from stages.hardware.device import cores
+from stages.io.amounts import duration, short_count
 from stages.io.files import read_json, read_scene
 from stages.io.photos import spread
 from stages.render.renderer import TimeBudget, measured_speed

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import psutil
 
-from stages.amounts import bytes_in_words
 from stages.contract import StageError
+from stages.io.amounts import bytes_in_words
 
 try:
     import resource

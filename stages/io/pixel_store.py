@@ -33,10 +33,10 @@ from filelock import FileLock, Timeout
 from torch import Tensor
 
 from nerf.runtime.parallel import in_order
-from stages.amounts import bytes_in_words
 from stages.contract import Progress, StageError
 from stages.hardware.memory import available_bytes
-from stages.io.live_line import live_line
+from stages.io.amounts import bytes_in_words
+from stages.io.stopwatch import live_line
 
 VERSION = 3  # raised when the same photos would give other pixels
 CHECKSUM_BYTES = 4

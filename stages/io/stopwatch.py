@@ -1,4 +1,4 @@
-"""How long work has taken so far, over all its attempts: one that was killed costs time like any other.
+"""How long work has taken so far, over all its attempts, one that was killed too; a live line that moves meanwhile.
 
 A killed program cannot say when it died. What it last wrote down does, by the machine's own running time: the times of
 files are those of a clock that can be put forward or back, of a machine that slept, or of a copy of the files.
@@ -11,9 +11,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from stages.contract import Progress
 from stages.io.files import write_durably
 
 BEAT = 5.0  # seconds between what is written: whatever ends the program takes no more than these with it
+LIVE_PERIOD = 0.5  # seconds between two live lines
 
 
 def elapsed(file: Path) -> float:
@@ -65,3 +67,20 @@ def periodically(seconds: float, act: Callable[[], object]) -> Iterator[None]:
     finally:
         over.set()
         thread.join()
+
+
+@contextmanager
+def live_line(progress: Progress, describe: Callable[[], tuple[str, float | None]]) -> Iterator[None]:
+    """While the block runs, say twice a second what ``describe`` answers: (message, finished share or None).
+
+    ``describe`` is called from another thread; what it reads may change under it but must not be taken apart.
+    """
+
+    def speak() -> None:
+        progress.update(*describe())
+
+    try:
+        with periodically(LIVE_PERIOD, speak):
+            yield
+    finally:
+        speak()

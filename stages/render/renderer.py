@@ -14,9 +14,9 @@ from nerf.effects.appearance import AppearanceModel
 from nerf.fields.interface import RadianceModel, Rendering
 from nerf.geometry.rays import Rays
 from nerf.rendering.images import render_image
-from stages.amounts import duration
 from stages.contract import Progress
 from stages.hardware.device import compute_device
+from stages.io.amounts import duration
 from stages.io.field_files import load_field
 from stages.io.files import read_json
 

@@ -13,10 +13,10 @@ import numpy as np
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays, join_rays
 from nerf.geometry.scene import Scene
-from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageError
 from stages.effects.image_effects import new_view_like, new_view_words, photo_effects
 from stages.hardware.memory import check_memory
+from stages.io.amounts import duration, short_count
 from stages.io.files import read_json, read_scene, write_png
 from stages.io.photos import spread
 from stages.io.transforms_export import intrinsics, opengl_matrix

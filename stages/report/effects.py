@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from stages.amounts import duration
+from stages.io.amounts import duration
 
 SHORTEST = 0.1  # seconds that are shown as a number
 # What to do about it; the effect's own reason says what was seen.

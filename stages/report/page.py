@@ -14,9 +14,9 @@ from markupsafe import Markup
 from PIL import Image
 
 from nerf.geometry.scene import Scene
-from stages.amounts import duration, short_count
 from stages.contract import Inputs
 from stages.evaluate.summary import scored_on
+from stages.io.amounts import duration, short_count
 from stages.io.ascii_names import shell_quoted
 from stages.io.files import read_json, read_scene, read_tensors
 from stages.io.pixels import load_pixels, pillow

@@ -15,7 +15,7 @@ from matplotlib.patches import Rectangle
 from nerf import REGION_HALF_SIZE
 from nerf.geometry.scene import Scene, View
 from nerf.training.learning_curve import PredictedGain, diminishing_returns_seconds, quality_at
-from stages.amounts import duration
+from stages.io.amounts import duration
 from stages.io.figures import INK, svg_element, svg_figure
 from stages.sfm.pairs.match_graph import natural_order
 from stages.train.curve import probe_curve

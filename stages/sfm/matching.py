@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from stages.amounts import rough_duration
 from stages.contract import Note
 from stages.ingest.masks import write_feature_masks
+from stages.io.amounts import rough_duration
 from stages.sfm.colmap.database import (
     RELAXED_RATIO,
     STRICT_RATIO,

@@ -13,8 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from stages.amounts import rough_duration
 from stages.contract import Note
+from stages.io.amounts import rough_duration
 from stages.io.files import make_durable
 from stages.sfm.colmap.diagnosis import find_conflict, links, supports
 from stages.sfm.colmap.final_bundle_adjustment import final_bundle_adjustment

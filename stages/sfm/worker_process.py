@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from stages.contract import Progress, StageError
-from stages.io.live_line import live_line
 from stages.io.photos import Photo
+from stages.io.stopwatch import live_line
 from stages.sfm.registration import count_done
 from stages.sfm.retry_strategies import OUT_OF_TIME, STRATEGIES, abandon
 

@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, replace
 from statistics import mean, stdev
 from typing import Any
 
-from stages.amounts import duration, resolution_name
+from stages.io.amounts import duration, resolution_name
 from stages.tradeoff.schedule import WORKSPACE_FIELD, Run, family_of, field_name
 from stages.train.config import FieldName
 

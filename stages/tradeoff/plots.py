@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from stages.amounts import duration, resolution_name
+from stages.io.amounts import duration, resolution_name
 from stages.io.figures import INK, svg_element, svg_figure
 
 COLUMNS = ("", "field", "photos", "steps", "training", "a frame", "peak memory", "model", "PSNR (dB)", "SSIM", "seeds")

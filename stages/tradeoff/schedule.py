@@ -14,10 +14,10 @@ from typing import Any, Literal, NamedTuple
 
 from nerf.geometry.scene import Scene, View
 from stages import train
-from stages.amounts import resolution_name
 from stages.contract import Inputs, Progress, plan_stage
 from stages.effects.decisions import Space, read_decisions
 from stages.hardware.device import processors
+from stages.io.amounts import resolution_name
 from stages.io.ascii_names import shell_quoted
 from stages.io.pixels import load_pixels
 from stages.train.config import FieldName

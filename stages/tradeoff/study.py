@@ -7,10 +7,10 @@ from statistics import mean, stdev
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from nerf.geometry.scene import Scene
-from stages.amounts import duration, resolution_name
 from stages.contract import Inputs, Progress, StageError, StageResult
 from stages.effects.decisions import read_decisions
 from stages.evaluate.tiles import MIN_TILES, TILE_SIZE
+from stages.io.amounts import duration, resolution_name
 from stages.io.files import read_scene, write_json
 from stages.io.stopwatch import counting
 from stages.tradeoff import plots

@@ -20,8 +20,8 @@ from nerf.training.learning_curve import (
     predicted_doubling_gain,
     quality_at,
 )
-from stages.amounts import duration, duration_option
 from stages.hardware.device import compute_device, cores
+from stages.io.amounts import duration, duration_option
 from stages.io.files import write_json
 from stages.train.config import OPTIONS_OF_FIELD, FieldName
 

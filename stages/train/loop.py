@@ -33,10 +33,10 @@ from nerf.training.schedule import (
     revised_by_clock,
 )
 from nerf.training.trainer import RAY_GEOMETRY, FieldTrainer, NonFinite
-from stages.amounts import short_count
 from stages.contract import Progress, StageError
+from stages.io.amounts import short_count
 from stages.io.files import read_json, write_durably
-from stages.io.live_line import live_line
+from stages.io.stopwatch import live_line
 from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from stages.train.health_check import TrainingFailure, failure_reason, needs_full_check, non_finite_tensor
 from stages.train.more import cannot_continue

@@ -11,12 +11,12 @@ import torch
 
 from nerf.runtime.matmul_precision import use_matmul_precision
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
-from stages.amounts import bytes_in_words, duration, short_count
 from stages.contract import Inputs, Progress
 from stages.effects.decisions import Decisions, read_decisions
 from stages.effects.image_effects import image_effects
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_on
+from stages.io.amounts import bytes_in_words, duration, short_count
 from stages.io.files import read_json, read_scene
 from stages.io.photos import read_photos
 from stages.train.config import SECONDS, Config

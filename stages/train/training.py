@@ -9,12 +9,12 @@ from nerf.geometry.scene import Scene
 from nerf.runtime.matmul_precision import use_matmul_precision
 from nerf.training.evaluation_pixels import sample_evaluation_pixels
 from nerf.training.ray_dataset import RayDataset
-from stages.amounts import short_count
 from stages.contract import Inputs, Progress, StageResult
 from stages.effects.decisions import read_decisions
 from stages.effects.image_effects import image_effects, learnt_effects
 from stages.hardware.device import compute_device, cores
 from stages.hardware.memory import check_memory
+from stages.io.amounts import short_count
 from stages.io.field_files import save_field
 from stages.io.files import read_scene
 from stages.train.checkpoints import checkpoint_files

@@ -6,8 +6,8 @@ from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import bsr_matrix
 
-from stages.amounts import bytes_in_words
 from stages.hardware.memory import available_bytes
+from stages.io.amounts import bytes_in_words
 from stages.sfm.colmap.observations import Observations, observations, points_in_camera, residuals
 
 MIN_OBSERVATIONS = 6  # of a photo: 12 equations for 6 unknowns; with fewer its pose is not known

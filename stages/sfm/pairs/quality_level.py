@@ -15,9 +15,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from stages.amounts import rough_duration
 from stages.contract import Progress, StageError
 from stages.hardware.device import processors
+from stages.io.amounts import rough_duration
 from stages.io.photos import Photo, spread
 from stages.sfm.colmap.database import (
     STRICT_RATIO,

@@ -9,12 +9,12 @@ from nerf.fields.mlp import HIDDEN
 from nerf.geometry.space_maps import SpaceMap
 from nerf.kernels import BOX, CONTRACTED_BOX
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
-from stages.amounts import bytes_in_words, short_count
 from stages.contract import Progress
 from stages.effects.decisions import Space
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.hardware.device import compute_device, cores
 from stages.hardware.memory import available_on
+from stages.io.amounts import bytes_in_words, short_count
 from stages.train.config import Config
 from stages.train.data import has_background_model, training_background
 from stages.train.fields.hash_grid_options import MAX_MICRO_BATCHES

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from pipeline.cli.durations import seconds_from
 from pipeline.cli.options import UsageError
-from stages.amounts import duration_option
+from stages.io.amounts import duration_option
 
 
 @given(st.integers(0, 99), st.integers(0, 59), st.integers(0, 59))

@@ -99,7 +99,7 @@ class Machine:
 
     @contextmanager
     def periodically(self, seconds: float, act: Callable[[], object]) -> Iterator[None]:
-        """stages/io/live_line.py, by this machine's clock."""
+        """stages/io/stopwatch.py, by this machine's clock."""
         self.beats[act] = seconds, self.now + seconds
         try:
             yield

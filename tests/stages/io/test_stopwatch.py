@@ -6,7 +6,7 @@ import pytest
 
 from stages.io import stopwatch
 from stages.io.files import read_json
-from stages.io.stopwatch import elapsed, write_elapsed
+from stages.io.stopwatch import elapsed, live_line, write_elapsed
 
 
 def test_the_seconds_of_earlier_attempts_count(tmp_path: Path) -> None:
@@ -55,3 +55,22 @@ def test_a_place_that_cannot_be_written_stops_nothing(tmp_path: Path, monkeypatc
     with stopwatch.counting(tmp_path / "gone/clock.json") as spent:
         time.sleep(0.05)
         assert spent() > 0.04
+
+
+def test_a_live_line_speaks_while_busy_and_at_the_end(progress, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stages.io.stopwatch.LIVE_PERIOD", 0.01)
+    with live_line(progress, lambda: ("working", 0.5)):
+        deadline = time.monotonic() + 5
+        while not progress.updates and time.monotonic() < deadline:
+            time.sleep(0.01)
+        spoken = len(progress.updates)
+    assert spoken > 0
+    assert len(progress.updates) > spoken
+    assert set(progress.updates) == {("working", 0.5)}
+
+
+def test_an_error_gets_out_and_silences_the_live_line(progress) -> None:
+    with pytest.raises(KeyError), live_line(progress, lambda: ("working", None)):
+        raise KeyError("x")
+    spoken = len(progress.updates)
+    assert spoken == 1

@@ -2,8 +2,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.amounts import resolution_name
 from stages.effects.decisions import Space
+from stages.io.amounts import resolution_name
 from stages.tradeoff.schedule import (
     ABLATIONS,
     DESCRIPTIONS,

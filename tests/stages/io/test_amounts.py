@@ -1,6 +1,6 @@
 import pytest
 
-from stages.amounts import bytes_in_words, duration, duration_option, rough_duration, short_count
+from stages.io.amounts import bytes_in_words, duration, duration_option, rough_duration, short_count
 
 
 @pytest.mark.parametrize(
