@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from nerf.effects.statistics.statistic import Evidence
+from nerf.effects.statistics.statistic import Statistic
 from nerf.training.trainer import NonFinite
 from pipeline.engine import manifests
 from pipeline.engine.display import SilentDisplay
@@ -16,7 +16,7 @@ from stages.contract import run_stage
 from stages.effects import pilots, study
 from stages.effects.decisions import Decisions, read_decisions, write_decisions
 from stages.effects.pilots import Pilot
-from stages.effects.study import SceneEvidence
+from stages.effects.study import SceneStatistics
 from stages.io.files import write_json
 from tests.effect_scenes import Effects, effect_scene
 from tests.stages.photo_scene import photographed
@@ -24,8 +24,8 @@ from tests.stages.photo_scene import photographed
 CLEAR = {"exposure": False, "view_dependence": True, "background": True, "pose_refinement": False, "vignetting": True}
 
 
-def found(called_for: bool | None, noise: float = 0.1) -> Evidence:
-    return Evidence(1.0, "EV", 2.0, noise, called_for, "one of two")
+def found(called_for: bool | None, noise: float = 0.1) -> Statistic:
+    return Statistic(1.0, "EV", 2.0, noise, called_for, "one of two")
 
 
 @pytest.fixture
@@ -40,12 +40,12 @@ def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
     monkeypatch.setattr(study, "time", SimpleNamespace(perf_counter=lambda: now[0]))
 
     def run(
-        config: effects.Config, gain: float = 1.0, pilot: Callable | None = None, **given: Evidence
+        config: effects.Config, gain: float = 1.0, pilot: Callable | None = None, **given: Statistic
     ) -> tuple[Decisions, dict, str, list[str]]:
         told = {name: found(value) for name, value in CLEAR.items()} | given
         measured = {"exposure": np.full((count, 3), 0.5)}
         took = {name: 0.25 if name == "exposure" else 0.5 for name in told}
-        monkeypatch.setattr(study, "scene_evidence", lambda *_: SceneEvidence(told, measured, took))
+        monkeypatch.setattr(study, "scene_statistics", lambda *_: SceneStatistics(told, measured, took))
         tried: list[str] = []
 
         def run_pilot(_trial: object, off: Decisions, on: Decisions, *_rest: object) -> Pilot:
