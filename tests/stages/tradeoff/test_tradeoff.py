@@ -3,7 +3,7 @@ import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import psutil
@@ -281,14 +281,14 @@ def test_fields_are_scored_over_the_photos_background(tmp_path: Path, photos: di
 def test_a_run_that_does_not_learn_is_told(
     tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = train.run
+    whole = run_stage
 
-    def diverges(config: train.Config, *rest: Any) -> Any:
+    def diverges(stage: ModuleType, config: train.Config, *rest: Any) -> Any:
         if not config.vanilla.positional_encoding:
             raise StageError("train.diverged", "training diverged", "it was told to", "Do not tell it to.")
-        return whole(config, *rest)
+        return whole(stage, config, *rest)
 
-    monkeypatch.setattr(train, "run", diverges)
+    monkeypatch.setattr(benchmark, "run_stage", diverges)
     result = studied(tmp_path, photos, progress, seeds=1)
     content = read_json(tmp_path / "tradeoff.json")
     named = content["left_out"][-1]
@@ -303,9 +303,9 @@ def test_a_run_that_does_not_learn_is_told(
 def test_lack_of_memory_ends_and_resumes_the_study(
     tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole, asked = train.run, list[int]()
+    whole, asked = run_stage, list[int]()
 
-    def short_of_memory(config: train.Config, *rest: Any) -> Any:
+    def short_of_memory(stage: ModuleType, config: train.Config, *rest: Any) -> Any:
         asked.append(config.steps or 0)
         if len(asked) == 2:
             raise StageError(
@@ -314,9 +314,9 @@ def test_lack_of_memory_ends_and_resumes_the_study(
                 "5 grids take 1 TB and 8 GB are free",
                 "Smaller ones.",
             )
-        return whole(config, *rest)
+        return whole(stage, config, *rest)
 
-    monkeypatch.setattr(train, "run", short_of_memory)
+    monkeypatch.setattr(benchmark, "run_stage", short_of_memory)
     small = {"seconds": 8.0, "seeds": 1}
     with refused("tradeoff.stopped", "grid, full resolution", "seed 0", "not enough memory"):
         studied(tmp_path, photos, progress, **small)
