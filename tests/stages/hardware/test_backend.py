@@ -157,5 +157,5 @@ def test_what_torch_trained_stays_with_torch_in_every_stage(stage: ModuleType, t
     run_stage(train, tiny("torch", steps=2), inputs, tmp_path / "train", progress)
     assert AS_TRAINED not in progress.notes
     with contextlib.suppress(StageError):  # two steps may leave no surface
-        stage.run(LATER[stage], inputs | {"train": tmp_path / "train"}, tmp_path / "later", progress)
+        run_stage(stage, LATER[stage], inputs | {"train": tmp_path / "train"}, tmp_path / "later", progress)
     assert progress.notes.count(AS_TRAINED) == 1

@@ -86,6 +86,7 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from stages import sfm
+from stages.contract import run_stage
 from pipeline.engine.display import SilentDisplay
 run_stage(sfm, sfm.Config(max_features=1000), {"ingest": Path(sys.argv[1])}, Path(sys.argv[2]), SilentDisplay())
 """
