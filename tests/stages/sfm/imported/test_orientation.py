@@ -20,7 +20,7 @@ from stages.io.pixels import load_pixels
 from stages.io.sparse_model import SparseImage, SparseModel
 from stages.sfm.colmap.cameras import camera_rays, project
 from stages.sfm.colmap.models import read_model, write_model
-from stages.sfm.imported.orientation import QUARTER_TURNS, pixel_map, turned_camera, turned_pose
+from stages.sfm.imported.orientation import QUARTER_TURNS, pixel_map, same_shape, turned_camera, turned_pose
 from stages.sfm.imported.pose_files import ImportedPoses, read_poses
 from tests.camera_layouts import ring
 from tests.refusals import codes, refused
@@ -179,6 +179,15 @@ def read_one(folder: Path, taken: Photo, **values: Any) -> ImportedPoses:
     frame = {"file_path": "p.jpg", "transform_matrix": np.eye(4).tolist()}
     file.write_text(json.dumps({**LENS, "frames": [frame | values]}))
     return read_poses(file, [taken], {"p.jpg": taken.name})
+
+
+@pytest.mark.parametrize("factor", [1, 2, 4, 7])
+def test_reduced_photos_have_whole_pixels(factor: int) -> None:
+    camera = Camera("SIMPLE_PINHOLE", 400, 267, (300.0, 200.0, 133.5))
+    width, height = 400 / factor, 267 / factor
+    for size in ((math.floor(width), math.floor(height)), (round(width), math.ceil(height))):
+        assert same_shape(camera, size)
+    assert not same_shape(camera, (round(width), round(height) + math.ceil(10 / factor)))
 
 
 @pytest.mark.parametrize("orientation", [2, 4, 5, 7])
