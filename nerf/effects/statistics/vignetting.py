@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf.effects.statistics.exposure import EV, ExposureFit
-from nerf.effects.statistics.statistic import MIN_EFFECT, VALUE_PER_LOG_LIGHT, Evidence, classify, unknown
+from nerf.effects.statistics.statistic import MIN_EFFECT, VALUE_PER_LOG_LIGHT, Statistic, classify, unknown
 from nerf.effects.statistics.tracks import TrackColours, log_light
 
 # Light at radius r (half diagonals) is exp(a r^2). Over the pixels of a photo r^2 deviates by some 0.24 from its mean,
@@ -24,7 +24,7 @@ def vignetting_slope(tracks: TrackColours, fit: ExposureFit) -> tuple[float, flo
     return float(found[:, 0].mean()), float(np.sqrt(np.mean(found[:, 1] ** 2)))
 
 
-def vignetting_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence:
+def vignetting_statistic(tracks: TrackColours, fit: ExposureFit) -> Statistic:
     """By how much corners are darker than the middle, EV; below 0 they are brighter, which no lens makes them."""
     if not fit.known.any():
         return unknown("EV", THRESHOLD_EV, fit.unknown_because, False)
