@@ -1,12 +1,13 @@
 """What mapping makes of many photos whose focal length is free from the first photo on, or held until all are mapped.
 
-    python -m benchmarks.held_focal_lengths WORKSPACE [--seeds 3] [--distortion 0 -0.15] [--focal 0.8] [--out FILE.json]
+    python -m benchmarks.held_focal_lengths DATABASE IMAGES [--seeds 0 1 2] [--distortion 0 -0.15] [--focal 1 0.8]
 
-WORKSPACE has a finished stage ingest of photos in a numbered row that share one camera. Each photo is matched with its
-next 15. With ``--distortion K`` the keypoints are moved to where a lens r (1 + K r²) would have shown them, and
-verified anew. Each seed then maps the thinned matches twice, and all intrinsics are adjusted once at the end. Held is
-the calibrated focal length, or ``--focal`` times it. Printed, and written as JSON: how many photos are registered, the
-focal length while mapping and adjusted, the error, how many verified pairs agree with the poses, CPU seconds.
+DATABASE is the matches-*.db that stage sfm has in its folder while it maps, and leaves there where it is killed then;
+IMAGES the folder of its photos, which share one camera. With ``--distortion K`` the keypoints are moved to where a
+lens r (1 + K r²), r in units of the guessed focal length, would have shown them, and verified anew. Each seed then maps
+the thinned matches twice, and all intrinsics are adjusted once at the end. Held is the calibrated focal length, or
+``--focal`` times it. Printed, and written as JSON with ``--out``: how many photos are registered, the focal length
+while mapping and adjusted, the error, how many verified pairs agree with the poses, CPU seconds.
 """
 
 import argparse
@@ -20,56 +21,38 @@ import numpy as np
 import pycolmap
 
 from benchmarks.record import Record, add_out
-from stages.io.photos import read_photos
-from stages.sfm.colmap.database import (
-    STRICT_RATIO,
-    ExtractionOptions,
-    Features,
-    extract_features,
-    fill_database,
-    match_pairs,
-)
+from stages.sfm.colmap.database import Features
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
-from stages.sfm.colmap.mapping import MAPPING_MODEL, incremental_options, map_incrementally
+from stages.sfm.colmap.mapping import incremental_options, map_incrementally
 from stages.sfm.colmap.repair import check_model
 from stages.sfm.colmap.thinning import thin_matches
-from stages.sfm.pairs.match_graph import pairs_apart
-from stages.sfm.pairs.pair_selection import union
 from stages.sfm.retry_strategies import STRATEGIES
-
-PAIRS_APART = 15  # of each photo's next ones
 
 
 def main() -> None:
     """Map the photos in every way."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("workspace", type=Path)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("database", type=Path)
+    parser.add_argument("images", type=Path)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--distortion", type=float, nargs="+", default=[0.0])
     parser.add_argument("--focal", type=float, nargs="+", default=[1.0])
     add_out(parser)
     asked = parser.parse_args()
-    ingest = next((asked.workspace / "ingest").iterdir())
-    photos = sorted((p for p in read_photos(ingest) if not p.near_duplicate_of), key=lambda p: p.file)
     record, pycolmap.logging.minloglevel = Record(asked.out), 3
     with tempfile.TemporaryDirectory() as scratch:
-        matched = Path(scratch, "matches.db")
-        fill_database(matched, photos, MAPPING_MODEL)
-        extract_features(matched, ingest / "images", photos, ExtractionOptions(1600, 4096))
-        pairs = union(pairs_apart(np.arange(len(photos)), 1, PAIRS_APART))
-        match_pairs(matched, pairs, 0, STRICT_RATIO)
         for distortion in asked.distortion:
-            database, thinned = matched, Path(scratch, "thinned.db")
+            database, thinned = asked.database, Path(scratch, "thinned.db")
             if distortion:
                 database = Path(scratch, "distorted.db")
-                distort(matched, database, distortion)
+                distort(asked.database, database, distortion)
             told = thin_matches(database, thinned)
             calibrated = focal_length(thinned)
             for factor in asked.focal:
                 set_focal_length(thinned, factor * calibrated)
-                for seed in range(asked.seeds):
+                for seed in asked.seeds:
                     for held in (False, True):
-                        figures = mapped(thinned, database, ingest / "images", seed, held)
+                        figures = mapped(thinned, database, asked.images, seed, held)
                         record.add(distortion=distortion, told=told, begins_px=round(factor * calibrated), **figures)
 
 
