@@ -18,7 +18,6 @@ ON_REQUEST = True
 PUBLISHED = ("points.ply",)
 NOT_HASHED = ("seconds",)  # it decides the size of the depth maps, and that enters the key
 
-DEFAULT_SIDE = 640  # pixels of the longer side of a depth map
 PAIRS_PER_PHOTO = 2.5  # of four neighbours each, most of them chosen by both
 PAIR_SECONDS, PHOTO_SECONDS = 0.35, 0.5  # of a core, at the default size
 

@@ -7,6 +7,8 @@ is: noise of variance s² in the images gives a disparity the variance s² / sum
 bare wall, where semi-global matching only continues what it saw at its border, comes out as what it is: not known.
 """
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -31,6 +33,7 @@ NOISE_IN_GRADIENTS = 8.0
 MAX_BESIDE_PX, ENDS_WINDOW = 1.5, 5
 MAX_SIGMA_PX = 0.5
 MIN_SIGMA_PX = 0.05  # what resampling, poses and the camera model leave however strong the texture
+UNKNOWN = (float("nan"),)
 MAX_SLOPE = 1.0  # pixels of disparity from one pixel to the next: beyond it there is an edge
 
 
@@ -79,22 +82,22 @@ class Disparities:
 
     def of_photo(self, photo: Viewpoint, used: Bool[np.ndarray, "h w"]) -> Candidate:
         """What the pair says of the pixels of its left photo."""
-        at = coordinates(self.pair, photo) - np.float32([self.pair.left, self.pair.top])
-        at = np.where(np.isfinite(at), at, np.float32(-9))
-        outside = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
-        value = cv2.remap(self.value, at, None, cv2.INTER_LINEAR, **outside)
-        sigma = cv2.remap(self.sigma, at, None, cv2.INTER_NEAREST, **outside)
+        x, y = coordinates(self.pair, photo)
+        x, y = (np.where(np.isfinite(axis), axis, np.float32(-9)) for axis in (x - self.pair.left, y - self.pair.top))
+        value = cv2.remap(self.value, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=UNKNOWN)
+        sigma = cv2.remap(self.sigma, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=UNKNOWN)
         per_pixel = self.pair.inverse_per_disparity(photo)
         known = used & (value > 0) & np.isfinite(sigma)
-        return Candidate(*(np.where(known, one * per_pixel, np.float32(np.nan)) for one in (value, sigma)), per_pixel)
+        inverse, sigma = (np.where(known, one * per_pixel, np.float32(np.nan)) for one in (value, sigma))
+        return Candidate(inverse, sigma, per_pixel)
 
 
 def match(pair: Rectified, photos: tuple[Viewpoint, Viewpoint], pixels: tuple[Pixels, Pixels]) -> Disparities:
     """The disparities of the first photo, the left one, in the second."""
     room = pair.disparities  # to the left of the left image, so that all of its pixels have all disparities
     width = pair.width + room
-    left, left_used = resampled(pair, photos[0], pixels[0], (pair.left - room, width))
-    right, right_used = resampled(pair, photos[1], pixels[1], (pair.left - room - pair.min_disparity, width))
+    left = resampled(pair, photos[0], pixels[0], (pair.left - room, width))
+    right = resampled(pair, photos[1], pixels[1], (pair.left - room - pair.min_disparity, width))
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=room,
@@ -108,52 +111,83 @@ def match(pair: Rectified, photos: tuple[Viewpoint, Viewpoint], pixels: tuple[Pi
         speckleRange=SPECKLE_RANGE,
         mode=cv2.STEREO_SGBM_MODE_HH,
     )
-    found = matcher.compute(left, right).astype(np.float32) / 16
-    found[(found < 0) | ~left_used] = np.nan
-    value, sigma = _refined(found, left, right, right_used)
+    found = matcher.compute(left.grey, right.grey).astype(np.float32) / 16
+    found[(found < 0) | ~left.used] = np.nan
+    value, sigma = _refined(found, left.grey, right)
     return Disparities(pair, value[:, room:] + np.float32(pair.min_disparity), sigma[:, room:])
 
 
+class _Windows(NamedTuple):
+    """Sums over the window around each pixel, once the right image is moved by the disparities: of squared gradients,
+    of gradient times difference, of squared differences, of pixels; and where the squared gradients' middle is."""
+
+    squares: Float[np.ndarray, "h w"]
+    products: Float[np.ndarray, "h w"]
+    differences: Float[np.ndarray, "h w"]
+    pixels: Float[np.ndarray, "h w"]
+    beside: Float[np.ndarray, "h w"]
+
+    @classmethod
+    def of(cls, disparity: np.ndarray, left: np.ndarray, right: np.ndarray) -> "_Windows":
+        """``left`` and ``right`` are float32."""
+        height, width = left.shape
+        x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        at = np.where(np.isfinite(disparity), x - disparity, -9).astype(np.float32)
+        seen = (at > 0) & (at < width - 1)
+        moved = cv2.remap(right, at, y, cv2.INTER_LINEAR)
+        slopes = _slope(left) + cv2.remap(_slope(right), at, y, cv2.INTER_LINEAR)
+        gradient, difference = np.where(seen, slopes / 2, 0), np.where(seen, left - moved, 0)
+        squares = _summed(gradient * gradient)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            beside = np.hypot(*(_summed(gradient * gradient * axis) / squares - axis for axis in (x, y)))
+        products, differences = _summed(gradient * difference), _summed(difference * difference)
+        return cls(squares, products, differences, _summed(seen.astype(np.float32)), beside)
+
+    def step(self) -> Float[np.ndarray, "h w"]:
+        """By how much disparities are too large, MAX_REFINEMENT_PX at most."""
+        step = np.divide(self.products, self.squares, out=np.zeros_like(self.squares), where=self.squares > 0)
+        return np.clip(step, -MAX_REFINEMENT_PX, MAX_REFINEMENT_PX)
+
+    def sigma(self) -> Float[np.ndarray, "h w"]:
+        """The standard deviation of a disparity; infinite or NaN without texture."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            left_over = np.maximum(self.differences - np.square(self.products) / self.squares, 0)
+            noise = left_over / np.maximum(self.pixels - 2, 1)
+            texture = np.maximum(self.squares - self.pixels * noise / NOISE_IN_GRADIENTS, 0)
+            return np.hypot(np.sqrt(noise / texture), MIN_SIGMA_PX)
+
+
 def _refined(
-    disparity: Float[np.ndarray, "h w"],
-    left: UInt8[np.ndarray, "h w"],
-    right: UInt8[np.ndarray, "h w"],
-    right_used: Bool[np.ndarray, "h w"],
+    found: Float[np.ndarray, "h w"], left: UInt8[np.ndarray, "h w"], right: Pixels
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
     """Disparities after steps of Lucas and Kanade, and their standard deviations; NaN where they are not sure."""
-    height, width = left.shape
-    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    one, other = left.astype(np.float32), right.astype(np.float32)
-    slope = np.float32([[-0.5, 0, 0.5]])
-    one_slope, other_slope = cv2.filter2D(one, -1, slope), cv2.filter2D(other, -1, slope)
-    start = disparity
-    squares = sums = residuals = count = np.zeros_like(one)
-    for _ in range(REFINEMENTS):
-        known = np.isfinite(disparity)
-        at = np.where(known, x - disparity, -9)
-        seen = known & (at > 0) & (at < width - 1)
-        gradient = np.where(seen, (one_slope + cv2.remap(other_slope, at, y, cv2.INTER_LINEAR)) / 2, 0)
-        residual = np.where(seen, one - cv2.remap(other, at, y, cv2.INTER_LINEAR), 0)
-        window = {"ddepth": -1, "ksize": (REFINEMENT_WINDOW, REFINEMENT_WINDOW), "normalize": False}
-        squares = cv2.boxFilter(gradient * gradient, **window)
-        sums = cv2.boxFilter(gradient * residual, **window)
-        residuals = cv2.boxFilter(residual * residual, **window)
-        count = cv2.boxFilter(seen.astype(np.float32), **window)
-        step = np.divide(sums, squares, out=np.zeros_like(sums), where=squares > 0)
-        disparity = disparity - np.clip(step, -MAX_REFINEMENT_PX, MAX_REFINEMENT_PX)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        noise = np.maximum(residuals - sums * sums / squares, 0) / np.maximum(count - 2, 1)
-        texture = np.maximum(squares - count * noise / NOISE_IN_GRADIENTS, 0)
-        sigma = np.hypot(np.sqrt(noise / texture), MIN_SIGMA_PX)
-        beside = np.hypot(*(cv2.boxFilter(gradient * gradient * axis, **window) / squares - axis for axis in (x, y)))
-        at = np.rint(x - disparity)
-        sure = (sigma < MAX_SIGMA_PX) & (np.abs(disparity - start) < MAX_REFINEMENT_PX) & (at >= 0) & (at < width)
-    at = np.where(sure, at, 0).astype(int)
-    sure &= right_used[np.arange(height)[:, None], at]
+    one, other = left.astype(np.float32), right.grey.astype(np.float32)
+    windows = _Windows.of(found, one, other)
+    disparity = found - windows.step()
+    for _ in range(REFINEMENTS - 1):
+        windows = _Windows.of(disparity, one, other)
+        disparity = disparity - windows.step()
+    sigma = windows.sigma()
+    at = np.rint(np.arange(left.shape[1]) - disparity)
+    with np.errstate(invalid="ignore"):
+        sure = (sigma < MAX_SIGMA_PX) & (np.abs(disparity - found) < MAX_REFINEMENT_PX)
+        sure &= (at >= 0) & (at < left.shape[1])
+    sure &= right.used[np.arange(len(left))[:, None], np.where(sure, at, 0).astype(int)]
     sure &= ~_at_edges(np.where(sure, disparity, np.float32(np.nan)))
     ends = cv2.dilate((~sure).view(np.uint8), np.ones((ENDS_WINDOW, ENDS_WINDOW))) > 0
-    sure &= ~ends | (beside < MAX_BESIDE_PX)
-    return np.where(sure, disparity, np.float32(np.nan)), np.where(sure, sigma, np.float32(np.nan))
+    sure &= ~ends | (windows.beside < MAX_BESIDE_PX)
+    unknown = np.float32(np.nan)
+    return np.where(sure, disparity, unknown), np.where(sure, sigma, unknown).astype(np.float32)
+
+
+def _slope(image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Central differences along the rows."""
+    return cv2.filter2D(image, -1, np.array([[-0.5, 0, 0.5]], np.float32))
+
+
+def _summed(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Sums over the window around each pixel."""
+    return cv2.boxFilter(values, -1, (REFINEMENT_WINDOW, REFINEMENT_WINDOW), normalize=False)
 
 
 def _at_edges(disparity: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

@@ -19,7 +19,8 @@ from stages.sfm.colmap.cameras import project
 
 BEST_ANGLE_DEG = 7.0  # of a pair: below it the distance, above it the match gets uncertain
 NARROW_DEG, WIDE_DEG = 3.0, 10.0  # deviations of the weight below and above the best angle
-MAX_CANDIDATES = 24  # photos with most shared points of which angles are asked
+MIN_ANGLE_DEG = 0.5  # below it a pixel is a tenth of the distance
+MAX_CANDIDATES = 24  # photos of which the angles at all shared points are asked
 MIN_SHARED = 8.0  # weighted points
 SAME_SIDE, SAME_SIDE_COSINE = 0.5, 0.5  # weight of a candidate on the same side as a neighbour chosen already
 GRID = 9  # points along each side of the region that stand for tracks where there are none
@@ -65,7 +66,7 @@ def tracks_of(scene: Scene, views: Sequence[int], points: dict[str, np.ndarray])
 def _within(scene: Scene, view: View, points: Float[np.ndarray, "m 3"]) -> np.ndarray:
     camera, pose = scene.cameras[view.camera], view.scene_from_camera
     at = project(camera, (points - pose[:, 3]) @ pose[:, :3])
-    return ((at > 0) & (at < [camera.width, camera.height])).all(axis=1)
+    return np.all((at > 0) & (at < [camera.width, camera.height]), axis=1)
 
 
 def choose_pairs(
@@ -76,12 +77,22 @@ def choose_pairs(
     sees, shared = tracks.sees(len(poses)), tracks.shared(len(poses))
     chosen: dict[tuple[int, int], None] = {}
     for photo in range(len(poses)):
-        row = shared[photo].tocoo()
-        others = [int(other) for other in row.col[np.argsort(-row.data, kind="stable")] if other != photo]
-        weights = {other: _weight(photo, other, poses, tracks, sees) for other in others[:MAX_CANDIDATES]}
+        candidates = _candidates(photo, shared[photo].toarray()[0], poses, tracks.points[sees[photo].indices])
+        weights = {other: _weight(photo, other, poses, tracks, sees) for other in candidates}
         for other in _best(photo, weights, poses, neighbours, usable):
             chosen.setdefault((min(photo, other), max(photo, other)))
     return list(chosen)
+
+
+def _candidates(photo: int, shared: np.ndarray, poses: np.ndarray, seen: np.ndarray) -> list[int]:
+    """The MAX_CANDIDATES photos that look best by how many points they share and by the angle at the middle of those
+    that the photo sees."""
+    if not len(seen):
+        return []
+    towards = poses[:, :, 3] - np.median(seen, axis=0)
+    others = np.flatnonzero((shared >= MIN_SHARED) & (np.arange(len(poses)) != photo))
+    likely = shared[others] * _by_angle(np.broadcast_to(towards[photo], (len(others), 3)), towards[others])
+    return [int(other) for other in others[np.argsort(-likely, kind="stable")[:MAX_CANDIDATES]]]
 
 
 def _best(
@@ -106,13 +117,18 @@ def _best(
 
 def _weight(photo: int, other: int, poses: np.ndarray, tracks: Tracks, sees: csr_matrix) -> float:
     """The sum over the points that two photos share, each by the angle between the rays to it."""
-    both = sees[photo].multiply(sees[other]).indices
-    rays = [tracks.points[both] - poses[index, :, 3] for index in (photo, other)]
-    cosine = np.einsum("ni,ni->n", *rays) / np.maximum(
-        np.linalg.norm(rays[0], axis=1) * np.linalg.norm(rays[1], axis=1), 1e-30
-    )
-    off = np.degrees(np.arccos(np.clip(cosine, -1, 1))) - BEST_ANGLE_DEG
-    return float(np.exp(-0.5 * (off / np.where(off < 0, NARROW_DEG, WIDE_DEG)) ** 2).sum())
+    both = tracks.points[sees[photo].multiply(sees[other]).indices]
+    return float(_by_angle(both - poses[photo, :, 3], both - poses[other, :, 3]).sum())
+
+
+def _by_angle(rays: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """How much points count by the angle between the rays to them."""
+    lengths = np.linalg.norm(rays, axis=1) * np.linalg.norm(others, axis=1)
+    cosine = np.einsum("ni,ni->n", rays, others) / np.maximum(lengths, 1e-30)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    off = angle - BEST_ANGLE_DEG
+    weight = np.exp(-0.5 * (off / np.where(off < 0, NARROW_DEG, WIDE_DEG)) ** 2)
+    return np.where(angle < MIN_ANGLE_DEG, 0, weight)
 
 
 def depth_range(

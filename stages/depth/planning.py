@@ -4,7 +4,6 @@ import time
 from typing import TYPE_CHECKING
 
 from stages.contract import Inputs, Progress
-from stages.depth import DEFAULT_SIDE
 from stages.depth.matching import match
 from stages.depth.photos import TrainingPhotos, one_thread_each, read_training_photos
 from stages.hardware.device import processors
@@ -13,7 +12,7 @@ from stages.io.files import read_scene
 if TYPE_CHECKING:
     from stages.depth import Config
 
-MIN_SIDE, TIMED_SIDE = 160, 240  # pixels of the longer side
+DEFAULT_SIDE, MIN_SIDE, TIMED_SIDE = 640, 160, 240  # pixels of the longer side
 TIMED_PAIRS = 2
 COST_EXPONENT = 2.6  # of a pair's seconds by its side: pixels and disparities grow with it, what is fixed does not
 MATCHING_SHARE = 0.6  # of the time; the rest is for photos, for what neighbours agree on and for points

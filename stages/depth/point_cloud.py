@@ -25,6 +25,7 @@ MAX_OTHERS = 10  # photos that a photo's points are looked up in, those that sha
 MIN_TOLERANCE, TOLERANCE_SIGMAS = 0.004, 3.0  # of the distance, by which depth maps may differ on one surface
 NORMAL_WINDOW = 7  # pixels along each side of the patch whose plane gives a normal
 MIN_NORMAL_PIXELS = 9
+OPEN = 1e-14  # of the moments' determinant by their trace cubed: pixels in a row leave a direction open
 MAX_POINTS = 10_000_000
 ReadMap = Callable[[int], DepthMap]
 
@@ -88,9 +89,15 @@ def _of_photo(photos: TrainingPhotos, read: ReadMap, number: int, others: list[i
         finest &= ~(agrees & finer)
         colours.append(np.where(agrees[:, None], colour, np.float32(np.nan)))
     kept = np.flatnonzero(finest & (agreeing > 1) & (agreeing > seen_through))
-    colour = np.nanmedian(np.stack([one[kept] for one in colours]), axis=0)
+    colour = _medians(np.stack([one[kept] for one in colours]))
     normal = normals(viewpoint, depth)[row[kept], column[kept]] @ rotation.T
     return PointCloud(points[kept], normal, np.rint(colour).astype(np.uint8), agreeing[kept].astype(np.uint8))
+
+
+def _medians(values: Float[np.ndarray, "views n 3"]) -> Float[np.ndarray, "n 3"]:
+    """The lower median of each column's numbers; NaN are none. Several times faster than NumPy's."""
+    known = np.isfinite(values[..., :1]).sum(axis=0)
+    return np.take_along_axis(np.sort(values, axis=0), ((known - 1) // 2)[None], axis=0)[0]
 
 
 def _look_up(
@@ -127,18 +134,19 @@ def normals(viewpoint: Viewpoint, depth: DepthMap) -> Float[np.ndarray, "h w 3"]
         return cv2.boxFilter(values * known, cv2.CV_64F, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
 
     rows, columns = np.nonzero(summed(known) >= MIN_NORMAL_PIXELS)
-    moments, sums = np.empty((len(rows), 3, 3)), np.empty((len(rows), 3))
+    moments, sums = np.empty((3, 3, len(rows))), np.empty((3, len(rows)))
     for i in range(3):
-        sums[:, i] = summed(rays[..., i] * inverse)[rows, columns]
+        sums[i] = summed(rays[..., i] * inverse)[rows, columns]
         for j in range(i, 3):
-            moments[:, i, j] = moments[:, j, i] = summed(rays[..., i] * rays[..., j])[rows, columns]
-    spread = np.linalg.eigvalsh(moments)
-    solid = spread[:, 0] > 1e-9 * spread[:, 2]  # pixels in a row leave a direction open
-    plane = np.linalg.solve(np.where(solid[:, None, None], moments, np.eye(3)), sums[..., None])[..., 0]
-    length = np.linalg.norm(plane, axis=1)
-    solid &= length > 0
+            moments[i, j] = moments[j, i] = summed(rays[..., i] * rays[..., j])[rows, columns]
+    # The moments' inverse is their adjugate over their determinant, which is positive: only its direction is wanted.
+    adjugate = [np.cross(moments[(i + 1) % 3], moments[(i + 2) % 3], axis=0) for i in range(3)]
+    determinant = (moments[0] * adjugate[0]).sum(axis=0)
+    plane = sum(part * one for part, one in zip(adjugate, sums, strict=True))
+    length = np.linalg.norm(plane, axis=0)
+    solid = (determinant > OPEN * np.trace(moments) ** 3) & (length > 0)
     result = -rays
-    result[rows[solid], columns[solid]] = -plane[solid] / length[solid, None]
+    result[rows[solid], columns[solid]] = -(plane[:, solid] / length[solid]).T
     return result
 
 

@@ -141,7 +141,9 @@ def _outline(photo: Viewpoint, axes: np.ndarray) -> Float[np.ndarray, "4"]:
     return np.quantile(at, [OUTERMOST, 1 - OUTERMOST], axis=0).ravel()
 
 
-def _windows(outlines: Sequence[np.ndarray], focal: float, low: float, high: float) -> tuple:
+def _windows(
+    outlines: Sequence[np.ndarray], focal: float, low: float, high: float
+) -> tuple[tuple[int, int], tuple[int, int]]:
     """(left, right) and (top, bottom) of what both photos may show, in pixels of the left image."""
     (left, top, right, bottom), (left2, top2, right2, bottom2) = (focal * outline for outline in outlines)
     across = int(np.ceil(max(left, left2 + low))), int(np.floor(min(right, right2 + high)))
@@ -161,9 +163,9 @@ def resampled(pair: Rectified, photo: Viewpoint, pixels: Pixels, window: tuple[i
     at = at * [width / photo.camera.width, height / photo.camera.height] - 0.5
     inside = ((at > -0.5) & (at < [width - 0.5, height - 0.5])).all(axis=2)  # NaN, behind the camera, is not inside
     inside &= _comes_back(photo.camera, local, at, (width, height))
-    at = np.where(np.isfinite(at), at, -1).astype(np.float32)
-    grey = cv2.remap(pixels.grey, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    used = cv2.remap(pixels.used.view(np.uint8), at, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    x_map, y_map = np.moveaxis(np.where(np.isfinite(at), at, -1).astype(np.float32), 2, 0)
+    grey = cv2.remap(pixels.grey, x_map, y_map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    used = cv2.remap(pixels.used.view(np.uint8), x_map, y_map, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     return Pixels(grey, inside & (used > 0))
 
 
@@ -179,9 +181,9 @@ def _comes_back(camera: Camera, local: np.ndarray, at: np.ndarray, size: tuple[i
     return same[rows[:, None], columns]
 
 
-def coordinates(pair: Rectified, photo: Viewpoint) -> Float[np.ndarray, "height width 2"]:
+def coordinates(pair: Rectified, photo: Viewpoint) -> Float[np.ndarray, "2 height width"]:
     """Where the pixels of a photo lie on the plane, float32; NaN beside or behind it."""
     turn = (photo.scene_from_camera[:, :3].T @ pair.scene_from_rectified).astype(np.float32)
     local = photo.ray_directions @ turn
     ahead = np.where(local[..., 2:] > 1e-3, local[..., 2:], np.float32(np.nan))
-    return np.float32(pair.focal_px) * local[..., :2] / ahead
+    return np.moveaxis(np.float32(pair.focal_px) * local[..., :2] / ahead, 2, 0)

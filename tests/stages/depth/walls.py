@@ -5,7 +5,8 @@ by looking the picture up where a ray meets the nearest wall, so they cost next 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,6 +36,9 @@ class Wall(NamedTuple):
     picture: np.ndarray
 
 
+rays_of = cache(camera_rays)
+
+
 def wall(
     centre: Sequence[float], half: tuple[float, float], turn_deg: float = 0.0, texture: str = "strong", seed: int = 0
 ) -> Wall:
@@ -52,17 +56,12 @@ def picture(texture: str, size: Sequence[int], seed: int) -> np.ndarray:
     if texture == "repeated":
         tile = picture("strong", (32, 32), seed)
         return np.tile(tile, (-(-rows // 32), -(-columns // 32)))[:rows, :columns]
-    noise = sum(
-        scale
-        * cv2.resize(
-            random.normal(size=(rows // scale + 2, columns // scale + 2)),
-            (columns, rows),
-            interpolation=cv2.INTER_CUBIC,
-        )
-        for scale in (2, 4, 8, 16)
-    )
+    noise = np.zeros((rows, columns))
+    for scale in (2, 4, 8, 16):
+        coarse = random.normal(size=(rows // scale + 2, columns // scale + 2))
+        noise += scale * cv2.resize(coarse, (columns, rows), interpolation=cv2.INTER_CUBIC)
     contrast = {"strong": 0.2, "weak": 0.01, "none": 0.0}[texture]
-    return np.clip(0.5 + contrast * noise / noise.std(), 0, 1)
+    return np.clip(0.5 + contrast * noise / noise.std(), 0, 1).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,6 @@ class WallScene:
     noise: float = 1.0  # grey values
     mask: np.ndarray | None = None
     seed: int = 0
-    files: list[str] = field(default_factory=list)
 
     def trace(self, view: int, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(grey in [0, 1], distance) along rays (h, w, 3) of a camera; grey 0.5 and infinity where there is no wall."""
@@ -89,19 +87,15 @@ class WallScene:
             u, v = (at @ axis / (axis @ axis) for axis in (one.across, one.down))
             hit = (t > 0) & (t < distance) & (np.abs(u) <= 1) & (np.abs(v) <= 1)
             rows, columns = one.picture.shape
-            where = [
-                ((one_axis + 1) / 2 * count - 0.5).astype(np.float32) for one_axis, count in ((u, columns), (v, rows))
-            ]
-            colour = cv2.remap(
-                one.picture.astype(np.float32), *where, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-            )
+            x, y = ((w.astype(np.float32) + 1) / 2 * n - 0.5 for w, n in ((u, columns), (v, rows)))
+            colour = cv2.remap(one.picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             grey, distance = np.where(hit, colour, grey), np.where(hit, t, distance)
         return grey, distance
 
     def photo(self, view: int) -> np.ndarray:
         """(height, width, 3) uint8."""
         width, height = self.camera.width, self.camera.height
-        fine = self.trace(view, camera_rays(self.camera, SAMPLES * width, SAMPLES * height))[0]
+        fine = self.trace(view, rays_of(self.camera, SAMPLES * width, SAMPLES * height))[0]
         grey = fine.reshape(height, SAMPLES, width, SAMPLES).mean(axis=(1, 3))
         random = np.random.default_rng((self.seed, view))
         grey = 255 * grey * (self.gains[view] if self.gains else 1) + self.noise * random.normal(size=grey.shape)
@@ -109,7 +103,7 @@ class WallScene:
 
     def distances(self, view: int, width: int, height: int) -> np.ndarray:
         """The true depth map (height, width) of a photo; infinity where there is no wall."""
-        return self.trace(view, camera_rays(self.camera, width, height))[1]
+        return self.trace(view, rays_of(self.camera, width, height))[1]
 
     def tracks(self) -> dict[str, np.ndarray]:
         """points.safetensors: points of all walls, seen wherever they are in a photo and nothing hides them."""
