@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from stages.contract import Note, StageError
+from stages.contract import Note, StageError, listed
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,6 +15,11 @@ TRAIN, HELD_OUT = "transforms_train.json", ("transforms_test.json", "transforms_
 MAX_PATH_BYTES, MAX_NAME_BYTES = 2000, 250  # bytes, with room for an extension
 MAX_LETTERS = 60  # of a name, in an error
 ROUNDED = 1e-3  # what rounding may make of a 0
+MAX_KEYS = 6  # in an error
+_FRAME_HINT = (
+    "Rename what it calls otherwise, or convert it: file_path is a photo's file, transform_matrix 4 × 4, world from "
+    "camera, its axes x right, y up, z back."
+)
 _HINT = "Give a transforms.json as nerfstudio, instant-ngp or the NeRF-synthetic scenes write it."
 
 
@@ -23,7 +28,7 @@ def read_transforms(transforms: Path, *, may_be_empty: bool = False) -> dict[str
     ``transform_matrix``. Raises StageError otherwise."""
     what = f"cannot use {transforms.name}"
     try:
-        content = json.loads(transforms.read_text("utf-8-sig"))  # -sig: Windows writes a byte order mark
+        content = json.loads(transforms.read_bytes())  # UTF-8, 16 or 32, with a byte order mark or without
     except (ValueError, RecursionError) as error:
         raise StageError(
             "io.transforms-not-json", f"cannot read {transforms.name}", f"it is not JSON ({error})", _HINT
@@ -39,9 +44,7 @@ def read_transforms(transforms: Path, *, may_be_empty: bool = False) -> dict[str
 def _check_frames(frames: list[Any], what: str) -> None:
     for index, frame in enumerate(frames):
         if not (isinstance(frame, dict) and isinstance(frame.get("file_path"), str) and "transform_matrix" in frame):
-            raise StageError(
-                "io.transforms-incomplete-frame", what, f"frame {index} lacks file_path or transform_matrix", _HINT
-            )
+            raise StageError("io.transforms-incomplete-frame", what, _why_incomplete(index, frame), _FRAME_HINT)
         mask = frame.get("mask_path") or ""
         if not isinstance(mask, str):
             raise StageError(
@@ -50,6 +53,16 @@ def _check_frames(frames: list[Any], what: str) -> None:
         if wrong := next((name for name in (*photo_names(frame), mask) if not _is_name(name)), None):
             why = f"no file can have the name of frame {index}, {ascii(wrong)[:MAX_LETTERS]}"
             raise StageError("io.transforms-file-path", what, why, _HINT)
+
+
+def _why_incomplete(index: int, frame: Any) -> str:
+    if not isinstance(frame, dict):
+        return f"frame {index} is {ascii(frame)[:MAX_LETTERS]}, and no object with file_path and transform_matrix"
+    if "file_path" in frame and not isinstance(frame["file_path"], str):
+        return f"the file_path of frame {index} is {ascii(frame['file_path'])[:MAX_LETTERS]}, and no name of a file"
+    lacks = " and no ".join(key for key in ("file_path", "transform_matrix") if key not in frame)
+    has = listed([ascii(key)[1:-1][:MAX_LETTERS] for key in frame], MAX_KEYS) or "nothing"
+    return f"frame {index} has no {lacks}: it has {has}"
 
 
 def read_splits(
@@ -118,8 +131,8 @@ def _test_frames(file: str, content: dict[str, Any]) -> tuple[str, dict[str, Any
 
 
 def pose_matrix(matrix: Any) -> "Float[np.ndarray, '3 4']":
-    """The first three rows of a frame's ``transform_matrix``, which may be a flat list of its rows. Raises ValueError
-    for what is no matrix of that shape."""
+    """The first three rows of a frame's ``transform_matrix``, which may be a flat list of its rows, and homogeneous: as
+    a whole times a number. Raises ValueError for what is no matrix of that shape."""
     import numpy as np
 
     try:
@@ -128,12 +141,27 @@ def pose_matrix(matrix: Any) -> "Float[np.ndarray, '3 4']":
         raise ValueError("its transform_matrix is not a matrix of numbers") from error
     if pose.shape in ((12,), (16,)):
         pose = pose.reshape(-1, 4)
+    if pose.shape == (4, 4) and np.isfinite(pose).all() and pose[3, 3] and abs(pose[3, 3] - 1) > ROUNDED:
+        pose = pose / pose[3, 3]
     if pose.shape == (4, 4) and (np.abs(pose[3, :3]) > ROUNDED).any():
         row = ", ".join(f"{value:.4g}" for value in pose[3])
         raise ValueError(f"the last row of its transform_matrix is {row} and not 0, 0, 0, 1: it may be transposed")
     if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose[:3]).all():
         raise ValueError("its transform_matrix is not 4 × 4 (or 3 × 4) finite numbers")
     return pose[:3]
+
+
+def is_without_pose(matrix: Any) -> bool:
+    """Whether it stands for no pose, as programs write for photos that they could not align: null, zeros or NaN."""
+    import numpy as np
+
+    if matrix is None:
+        return True
+    try:
+        values = np.array(matrix, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return False
+    return values.size in (12, 16) and bool(np.isnan(values).any() or not values.reshape(-1, 4)[:3, :3].any())
 
 
 def photo_names(frame: dict[str, Any]) -> tuple[str, ...]:

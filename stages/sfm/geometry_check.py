@@ -225,12 +225,14 @@ def fits_as_a_whole(matches: PairMatches, check: PoseCheck) -> bool:
     return exact_enough or not check.median_px > MAX_NOISE_MULTIPLE * matches.noise_px
 
 
-def agreement(matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"]) -> tuple[int, int]:
-    """How many pairs agree with poses, and how many agree with or contradict them."""
+def agreement(
+    matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"], among: Bool[np.ndarray, "pairs"]
+) -> tuple[int, int]:
+    """How many pairs, of those ``among`` them, agree with poses, and how many agree with or contradict them."""
     error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera))
     _, tolerance = _tolerance_px(error, matches.weight)
-    agreeing = int((error <= tolerance).sum())
-    return agreeing, agreeing + int(_contradicts(matches, error, tolerance).sum())
+    agreeing = int((error <= tolerance)[among].sum())
+    return agreeing, agreeing + int(_contradicts(matches, error, tolerance)[among].sum())
 
 
 def _tolerance_px(

@@ -12,9 +12,11 @@ from stages.io.photos import Photo, read_frame_names
 from stages.io.sparse_model import SparseModel
 from stages.sfm.colmap.models import read_model, write_model
 from stages.sfm.imported.conventions import (
+    AXES,
     Fit,
     PoseConvention,
     axes_in_words,
+    columns_for,
     found_convention,
     named_axes,
 )
@@ -32,12 +34,13 @@ def import_poses(
     Raises StageError where they cannot be used, and where their photos show that they are of another convention.
     """
     known, errors = write_imported_model(cameras, convention, photos, ingest, folder, progress)
-    check = _check(known.model, photos, ingest, folder, progress)
+    check = _check(known.model, photos, ingest, folder, (cameras / "images.txt").is_file(), progress)
     if check and (fit := check.pop("fit")):
         read_as = convention.with_defaults(convention_of_format(cameras))
-        raise _another_convention(cameras.name, check, Fit(**fit), read_as)
+        names = _names(known.model, photos)
+        raise _another_convention(cameras.name, check, Fit(**fit), read_as, names)
     if check:
-        _note_doubts(check, known.model, photos, progress)
+        _note_doubts(cameras.name, check, known.model, photos, progress)
     judged = check.pop("images", {}) if check else {}
     unknown = {"agreement": None, "transfer_px": None}
     return {
@@ -78,47 +81,76 @@ def write_imported_model(
     return known, errors
 
 
-def _another_convention(name: str, check: dict[str, Any], fit: Fit, read_as: PoseConvention) -> StageError:
+def _another_convention(
+    name: str, check: dict[str, Any], fit: Fit, read_as: PoseConvention, photos: Sequence[str]
+) -> StageError:
     """The error for poses that agree with their photos under another convention than they were read with."""
     direction, axes = found_convention(fit, read_as)
-    known = named_axes(axes)
     how = f"as {direction.replace('-', ' ')}, its cameras with {axes_in_words(axes)}"
-    say_so = f"--sfm.pose-direction {direction} --sfm.camera-axes {known}"
+    how += ", in a left-handed world" * fit.mirrored + ", its quaternions as x, y, z, w" * fit.scalar_last
+    of = listed([photos[i] for i in fit.of], MAX_NAMES)
     return StageError(
         "sfm.other-pose-convention",
-        f"the poses of {name} contradict their photos",
+        f"the poses of {len(fit.of)} of {len(photos)} photos in {name} contradict the others" if fit.of
+        else f"the poses of {name} contradict their photos",
         f"{check['agreeing']} of {check['pairs']} verified pairs of photos agree with them; read {how}, "
-        f"{fit.agreeing} of {fit.pairs} do",
-        f"If that is how they are meant, add {say_so}." if known else
-        "Turn the cameras' axes to x right, y down, z forward and add --sfm.camera-axes opencv, or leave out the file.",
+        f"{fit.agreeing} of {fit.pairs} {f'pairs of these photos do: {of}' if fit.of else 'do'}",
+        _how_to_convert(fit, direction, axes, read_as),
     )  # fmt: skip
 
 
+def _how_to_convert(fit: Fit, direction: str, axes: Float[np.ndarray, "3 3"], read_as: PoseConvention) -> str:
+    """What to do with poses of this convention."""
+    known = named_axes(axes)
+    say_so = f"--sfm.pose-direction {direction} --sfm.camera-axes {known}"
+    if fit.scalar_last:
+        also = "" if known and (direction, known) == read_as else f", and add {say_so}" if known else ""
+        return f"Write the quaternions of images.txt as QW QX QY QZ{also}."
+    if known and not fit.of:
+        return f"If that is how they are meant, add {say_so}."
+    columns = f"take its columns {columns_for(AXES[read_as.axes or 'opencv'], axes)} (- means negated)"
+    of_which = f"the matrix of each of these {len(fit.of)}" if fit.of else "each matrix"
+    steps = [f"invert {of_which}", columns] if direction != read_as.direction else [f"of {of_which} {columns}"]
+    steps = [*steps, "negate its third row"] if fit.mirrored else steps
+    return f"To convert them, {', then '.join(steps)}; or leave the cameras out: pipeline run FOLDER"
+
+
 def _check(
-    model: SparseModel, photos: Sequence[Photo], ingest: Path, folder: Path, progress: Progress
+    model: SparseModel, photos: Sequence[Photo], ingest: Path, folder: Path, of_quaternions: bool, progress: Progress
 ) -> dict[str, Any] | None:
     """What verified matches of neighbouring photos say of imported poses; None, with a note, where they say nothing."""
     progress.update("comparing the cameras with what neighbouring photos show")
     posed = {image.file for image in model.images}
-    check = check_imported_poses([photo for photo in photos if photo.image_name in posed], ingest / "images", folder)
+    posed_photos = [photo for photo in photos if photo.image_name in posed]
+    check = check_imported_poses(posed_photos, ingest / "images", folder, of_quaternions)
     if why := check.get("failed"):
         progress.note("sfm.poses-unchecked", f"the imported poses could not be checked: {why}")
         return None
     return check
 
 
-def _note_doubts(check: dict[str, Any], model: SparseModel, photos: Sequence[Photo], progress: Progress) -> None:
+def _names(model: SparseModel, photos: Sequence[Photo]) -> list[str]:
+    """The photos' own names, in the order of the model's images."""
+    names = {photo.image_name: photo.name for photo in photos}
+    return [names[image.file] for image in model.images]
+
+
+def _note_doubts(
+    source: str, check: dict[str, Any], model: SparseModel, photos: Sequence[Photo], progress: Progress
+) -> None:
     """Note where photos contradict their imported poses."""
     if 2 * check["agreeing"] < check["pairs"]:
         progress.note(
             "sfm.poses-contradict",
-            f"the imported poses contradict their photos: {check['agreeing']} of {check['pairs']} verified pairs agree "
-            "with them, and more do under no other convention. Check what they are of, or leave out --cameras",
+            f"the cameras of {source} contradict their photos: only {check['agreeing']} of {check['pairs']} verified "
+            "pairs of photos agree with them, and no other convention of poses helps. Check its focal lengths, and "
+            "that these are the photos it was made for; or leave it out, and the cameras are found from the photos",
         )
     elif check["doubtful"]:
-        names = {photo.image_name: photo.name for photo in photos}
+        names = dict(zip([image.file for image in model.images], _names(model, photos), strict=True))
         who = listed([names[file] for file in check["doubtful"]], MAX_NAMES)
         progress.note(
             "sfm.doubtful-poses",
-            f"{len(check['doubtful'])} of {len(model.images)} imported poses contradict what their photos show: {who}",
+            f"{len(check['doubtful'])} of {len(model.images)} imported poses contradict what their photos show: {who}. "
+            f"They are used; correct or remove them in {source} if they are wrong",
         )

@@ -25,8 +25,9 @@ def stored_size(photo: Photo) -> tuple[int, int]:
 
 
 def same_shape(camera: Camera, size: tuple[int, int]) -> bool:
-    """Whether a picture of this width and height can be the camera's, made larger or smaller."""
-    return abs(size[0] * camera.height / (camera.width * size[1]) - 1) <= ASPECT_WITHIN
+    """Whether a picture of this width and height can be the camera's, made larger or smaller, of whole pixels."""
+    wanted = size[0] * camera.height / camera.width
+    return abs(wanted - size[1]) <= max(1.0, ASPECT_WITHIN * size[1])
 
 
 def fits_only_upright(camera: Camera, photo: Photo) -> bool:

@@ -31,7 +31,7 @@ from stages.sfm.colmap.database import (
 from stages.sfm.colmap.mapping import MAPPING_MODEL
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import camera_poses, check_model, facts
-from stages.sfm.imported.conventions import best_fit
+from stages.sfm.imported.conventions import MIN_PAIRS, best_fit, fit_of_some
 from stages.sfm.pairs.match_graph import MIN_INLIERS, natural_order, pairs_apart
 from stages.sfm.pairs.pair_selection import Pairs, closeness, nearest, union
 from stages.sfm.worker_process import environment
@@ -41,17 +41,20 @@ MAX_IMAGE_SIZE, MAX_FEATURES = 1000, 2000  # enough to tell a step of a few pixe
 PARTNERS = 6  # of each photo
 MAX_NAME_STEPS = 2  # positions before and after it, in the order of names
 TURN_DEG = 30.0  # two photos whose axes differ by so much count as far apart as two whose centres are usual neighbours
-MIN_PAIRS = 3  # verified pairs, for there to be any evidence
 
 
-def check_imported_poses(photos: Sequence[Photo], images: Path, folder: Path) -> dict[str, Any]:
-    """Check the model in ``folder/sparse``, whose images are these photos in order of ``file``.
+def check_imported_poses(
+    photos: Sequence[Photo], images: Path, folder: Path, of_quaternions: bool = False
+) -> dict[str, Any]:
+    """Check the model in ``folder/sparse``, whose images are these photos in order of ``file``. ``of_quaternions``: its
+    poses stood as quaternions in a text file, which somebody may have written in another order.
 
     Returns what :func:`stages.sfm.colmap.repair.facts` says, with the ``fit`` of another convention where the poses
     contradict their photos and it does not, or {"failed": why} where nothing could be compared. The
     model stays as it is.
     """
     job = {"photos": [asdict(photo) for photo in photos], "images": str(images.absolute()), "folder": str(folder)}
+    job["of_quaternions"] = of_quaternions
     with (folder / "sfm.log").open("ab") as log:
         answer = subprocess.run(
             [sys.executable, *COMMAND],
@@ -76,7 +79,7 @@ def main() -> None:
     os.write(channel, json.dumps(check(**job)).encode())
 
 
-def check(photos: list[dict[str, Any]], images: str, folder: str) -> dict[str, Any]:
+def check(photos: list[dict[str, Any]], images: str, folder: str, of_quaternions: bool) -> dict[str, Any]:
     """Match neighbours by pose and by name, and let their matches judge the poses."""
     some, scratch = [Photo(**photo) for photo in photos], Path(folder, "check")
     scratch.mkdir(exist_ok=True)
@@ -97,7 +100,9 @@ def check(photos: list[dict[str, Any]], images: str, folder: str) -> dict[str, A
     if checked is None:
         return {"failed": f"only {verified} pairs of neighbouring photos share enough features"}
     found = facts(model, checked)
-    fit = best_fit(checked.matches, poses) if 2 * found["agreeing"] < found["pairs"] else None
+    fit = best_fit(checked.matches, poses, of_quaternions) if 2 * found["agreeing"] < found["pairs"] else None
+    if fit is None and found["agreeing"] < found["pairs"]:
+        fit = fit_of_some(checked.matches, poses, checked.check.agrees)
     return found | {"fit": fit._asdict() if fit else None}
 
 

@@ -10,7 +10,7 @@ import os
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
@@ -24,7 +24,14 @@ from stages.ingest.sources import LLFF, own_registration
 from stages.io.colmap_files import MAX_COORDINATE
 from stages.io.photos import Photo
 from stages.io.sparse_model import SparseModel
-from stages.io.transforms_files import MAX_LETTERS, TRAIN, none_among_the_photos, pose_matrix, read_splits
+from stages.io.transforms_files import (
+    MAX_LETTERS,
+    TRAIN,
+    is_without_pose,
+    none_among_the_photos,
+    pose_matrix,
+    read_splits,
+)
 from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.conventions import (
     AS_DECLARED,
@@ -37,7 +44,7 @@ from stages.sfm.imported.conventions import (
 )
 from stages.sfm.imported.llff import read_llff
 from stages.sfm.imported.orientation import fits_only_upright, pixel_map, stored_size
-from stages.sfm.imported.posed_photos import HINT, PosedPhoto, distinct, posed_photo, unusable, without_rays
+from stages.sfm.imported.posed_photos import PosedPhoto, distinct, posed_photo, unusable, without_rays
 from stages.sfm.imported.transforms_intrinsics import contradictions, intrinsics_of, read_intrinsics
 
 # The root mean square stretch of a matrix beside its scale, as an angle, is about what its rotation is off by where the
@@ -45,6 +52,7 @@ from stages.sfm.imported.transforms_intrinsics import contradictions, intrinsics
 MAX_STRETCH_DEG, NOTED_STRETCH_DEG = 0.05, 0.005
 SCALED_WITHIN = 1e-3  # of 1: what rounding makes of a rotation's scale
 MAX_ENTRY = 1e6  # of a matrix that is looked at more closely: products of three of them are numbers
+SAME_POSE_WITHIN = 1e-9  # relatively: what printing makes of two copies
 MAX_NAMES, MAX_NAMES_OF_ERROR = 5, 2
 APPROXIMATION = "approximation"  # how the note begins of a camera model that stands for another
 
@@ -78,6 +86,7 @@ class ImportedPoses:
 
 class _Framed(NamedTuple):
     photo: Photo
+    where: str  # its frame, in words
     frame: Mapping[str, Any]
     values: Mapping[str, Any]  # of the frame, and of its file what the frame has none of
 
@@ -116,68 +125,139 @@ def _is_transforms(cameras: Path) -> bool:
 def _from_transforms(
     cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str], convention: PoseConvention
 ) -> ImportedPoses:
-    by_name = {photo.name: photo for photo in photos}
-    framed: dict[str, _Framed] = {}
-    absent, repeated, test_files, approximate = [], [], [], 0
-    unused: dict[str, Photo] = {}  # by file
-    splits, notes = read_splits(cameras, lambda frame: frames.get(frame["file_path"]) in by_name)
-    for where, content in splits:
-        held_out, in_no_split = _split(content, where, notes)
-        for frame in content["frames"]:
-            name = frame["file_path"]
-            photo = by_name.get(frames.get(name, ""))
-            if photo is None:
-                absent.append(name)
-                continue
-            file = photo.image_name
-            if PurePosixPath(name) in in_no_split:
-                unused[file] = photo
-                continue
-            values = intrinsics_of(frame, content)
-            if file in framed:
-                if {**values, "file_path": ""} != {**framed[file].values, "file_path": ""}:
-                    raise _two_frames(photo.name, framed[file].frame["file_path"], name)
-                repeated.append(name)
-                continue
-            framed[file] = _Framed(photo, frame, values)
-            approximate += str(values.get("note", "")).startswith(APPROXIMATION)
-            if PurePosixPath(name) in held_out:
-                test_files.append(file)
-        if held_out and not test_files:
-            notes.append(none_among_the_photos(len(held_out), where))
-    if repeated:
-        notes.append(Note("sfm.repeated-frames", f"{len(repeated)} frames are listed twice, alike: {_few(repeated)}"))
-    if approximate:
-        words = f"the camera models of {approximate} frames are approximations, as their notes in the file say"
-        notes.append(Note("sfm.approximate-cameras", words))
+    splits, notes = read_splits(cameras, lambda frame: frames.get(frame["file_path"]) in {p.name for p in photos})
+    found = _match_frames(splits, {photo.name: photo for photo in photos}, frames, notes)
+    framed = found.framed
     if not framed:
-        raise _nothing_matches(splits[0][0], absent, photos)
+        raise _nothing_usable(splits[0][0], found, photos)
     notes += _contradictions([content for _, content in splits], framed)
     upright = _are_of_upright_photos(framed.values())
     posed, rotations = zip(*(_from_frame(framed[file], upright, convention) for file in sorted(framed)), strict=True)
     notes += _rounded_or_scaled({one.name: rotation for one, rotation in zip(posed, rotations, strict=True)})
     left_out = without_rays(posed)
     kept = [one for one in posed if one.file not in left_out]
-    unposed = [photo.name for photo in photos if photo.image_name not in framed.keys() | unused.keys()]
-    kept_tests = sorted(set(test_files) - left_out.keys())
-    if test_files and not kept_tests:
+    known = framed.keys() | found.unused.keys() | found.poseless.keys()
+    unposed = [photo.name for photo in photos if photo.image_name not in known]
+    kept_tests = sorted(set(found.test_files) - left_out.keys())
+    if found.test_files and not kept_tests:
         words = "all official test photos are among those left out, so others are held out"
         notes.append(Note("sfm.tests-left-out", words))
-    if unused:
-        names = _few(sorted(photo.name for photo in unused.values()))
-        words = f"{len(unused)} photos are neither to train nor to test on and are left out: {names}"
-        notes.append(Note("sfm.in-no-split", words))
     return ImportedPoses(
         model=SparseModel.without_points(*distinct(kept)),
-        left_out=left_out | dict.fromkeys(unused, "the transforms file has it neither to train nor to test on"),
+        left_out=left_out
+        | dict.fromkeys(found.unused, "the transforms file has it neither to train nor to test on")
+        | dict.fromkeys(found.poseless, "its frame has no pose"),
         test_files=kept_tests or None,
-        notes=_notes(absent, unposed, posed, left_out) + notes,
+        notes=_notes(found.absent, unposed, posed, left_out) + notes,
     )
 
 
-def _two_frames(photo: str, first: str, second: str) -> StageError:
+@dataclass
+class _MatchedFrames:
+    """Frames with a photo, by file; what became of the others."""
+
+    framed: dict[str, _Framed] = field(default_factory=dict)
+    test_files: list[str] = field(default_factory=list)
+    absent: list[str] = field(default_factory=list)  # by file_path: no such photo
+    unused: dict[str, str] = field(default_factory=dict)  # photo by file: in no split
+    poseless: dict[str, str] = field(default_factory=dict)  # photo by file
+
+
+def _match_frames(
+    splits: Sequence[tuple[str, Mapping[str, Any]]],
+    by_name: Mapping[str, Photo],
+    frames: Mapping[str, str],
+    notes: list[Note],
+) -> _MatchedFrames:
+    found, repeated = _MatchedFrames(), []
+    for where, content in splits:
+        held_out, in_no_split = _split(content, where, notes)
+        for frame in content["frames"]:
+            name = frame["file_path"]
+            photo = by_name.get(frames.get(name, ""))
+            if photo is None:
+                found.absent.append(name)
+                continue
+            file = photo.image_name
+            if PurePosixPath(name) in in_no_split:
+                found.unused[file] = photo.name
+                continue
+            if is_without_pose(frame["transform_matrix"]):
+                found.poseless[file] = photo.name
+                continue
+            one = _framed(photo, frame, content, where)
+            if file in found.framed:
+                if differ := _differences(found.framed[file].values, one.values):
+                    raise _two_frames(photo.name, where, found.framed[file].frame["file_path"], name, differ)
+                repeated.append(name)
+                continue
+            found.framed[file] = one
+            if PurePosixPath(name) in held_out:
+                found.test_files.append(file)
+        if held_out and not found.test_files:
+            notes.append(none_among_the_photos(len(held_out), where))
+    notes += _on_frames(found, repeated)
+    return found
+
+
+def _framed(photo: Photo, frame: Mapping[str, Any], content: Mapping[str, Any], source: str) -> _Framed:
+    where = f"frame {frame['file_path']!r} of {source}"
+    try:
+        return _Framed(photo, where, frame, intrinsics_of(frame, content))
+    except ValueError as error:
+        raise _wrong_intrinsics(where, error) from error
+
+
+def _on_frames(found: _MatchedFrames, repeated: Sequence[str]) -> list[Note]:
+    """Notes on frames that are listed twice, have no pose, or say that their camera model is another."""
+    notes = []
+    if repeated:
+        notes.append(Note("sfm.repeated-frames", f"{len(repeated)} frames are listed twice, alike: {_few(repeated)}"))
+    approximate = [one for one in found.framed.values() if str(one.values.get("note", "")).startswith(APPROXIMATION)]
+    if approximate:
+        words = f"the camera models of {len(approximate)} frames are approximations, as their notes in the file say"
+        notes.append(Note("sfm.approximate-cameras", words))
+    if found.poseless:
+        count = f"{len(found.poseless)} of {len(found.poseless) + len(found.framed)} frames"
+        words = f"{count} have no pose (null, zeros or NaN), and their photos are left out"
+        notes.append(Note("sfm.frames-without-pose", f"{words}: {_few(sorted(found.poseless.values()))}"))
+    if found.unused:
+        names = _few(sorted(found.unused.values()))
+        words = f"{len(found.unused)} photos are neither to train nor to test on and are left out: {names}"
+        notes.append(Note("sfm.in-no-split", words))
+    return notes
+
+
+def _nothing_usable(source: str, found: _MatchedFrames, photos: Sequence[Photo]) -> StageError:
+    if not found.poseless:
+        return _nothing_matches(source, found.absent, photos)
+    return unusable(
+        "sfm.no-poses",
+        f"the poses of {source}",
+        f"the transform_matrix of all {len(found.poseless)} frames is null, zeros or NaN",
+    )
+
+
+def _differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
+    """The keys in which two frames of a photo differ, but for how they spell its name, and for rounding."""
+    differ = {key for key in first.keys() | second.keys() if first.get(key) != second.get(key)} - {"file_path"}
+    try:
+        first_pose, second_pose = (pose_matrix(one["transform_matrix"]) for one in (first, second))
+        if np.allclose(first_pose, second_pose, rtol=SAME_POSE_WITHIN, atol=SAME_POSE_WITHIN):
+            differ -= {"transform_matrix"}
+    except ValueError:  # no matrices: they differ as they stand
+        pass
+    return sorted(differ)
+
+
+def _two_frames(photo: str, source: str, first: str, second: str, differ: Sequence[str]) -> StageError:
     which = f"{first!r} is listed twice" if first == second else f"they are {first!r} and {second!r}"
-    return StageError("sfm.two-frames", f"two frames for the photo {photo} differ", which, HINT)
+    return StageError(
+        "sfm.two-frames",
+        f"two frames of {source} for the photo {photo} differ",
+        f"{which}, and differ in {_few(differ)}",
+        "Remove one of them and run again.",
+    )
 
 
 def _split(content: Mapping[str, Any], source: str, notes: list[Note]) -> tuple[set[PurePosixPath], set[PurePosixPath]]:
@@ -261,9 +341,11 @@ def _given_camera(framed: _Framed, upright: bool) -> Camera:
     try:
         return read_intrinsics(framed.values, *size)
     except ValueError as error:
-        raise unusable(
-            "sfm.frame-intrinsics", f"the camera of frame {framed.frame['file_path']!r}", str(error)
-        ) from error
+        raise _wrong_intrinsics(framed.where, error) from error
+
+
+def _wrong_intrinsics(where: str, why: ValueError) -> StageError:
+    return unusable("sfm.frame-intrinsics", f"the camera of {where}", str(why))
 
 
 class _Rotation(NamedTuple):
@@ -276,36 +358,36 @@ class _Rotation(NamedTuple):
 
 def _from_frame(framed: _Framed, upright: bool, convention: PoseConvention) -> tuple[PosedPhoto, _Rotation]:
     name = framed.frame["file_path"]
-    matrix, rotation = _rigid(framed.frame["transform_matrix"], name)
+    matrix, rotation = _rigid(framed.frame["transform_matrix"], framed.where)
     pose = world_from_camera(matrix, convention)
-    return posed_photo(framed.photo, name, _given_camera(framed, upright), pose, upright), rotation
+    return posed_photo(framed.photo, name, framed.where, _given_camera(framed, upright), pose, upright), rotation
 
 
-def _rigid(matrix: Any, name: str) -> tuple[Float[np.ndarray, "3 4"], _Rotation]:
+def _rigid(matrix: Any, where: str) -> tuple[Float[np.ndarray, "3 4"], _Rotation]:
     """A matrix as written in a transforms file with the rotation that is nearest to it."""
+    what = f"the transform_matrix of {where}"
     try:
         pose = pose_matrix(matrix)
     except ValueError as error:
-        raise unusable("sfm.frame-pose", f"frame {name!r}", str(error)) from error
+        raise unusable("sfm.frame-pose", what, str(error)) from error
     if (distance := np.abs(pose[:, 3]).max()) > MAX_COORDINATE:
         why = f"its position is {distance:.3g} units from the origin, and the most is {MAX_COORDINATE:g}"
-        raise unusable("sfm.pose-far-away", f"the transform_matrix of frame {name!r}", why)
+        raise unusable("sfm.pose-far-away", what, why)
     if not (largest := np.abs(pose[:, :3]).max()) <= MAX_ENTRY:
-        raise unusable(
-            "sfm.pose-large-entry",
-            f"the transform_matrix of frame {name!r}",
-            f"it is no rotation: {largest:.3g} is in it",
-        )
+        raise unusable("sfm.pose-large-entry", what, f"it is no rotation: {largest:.3g} is in it")
     if np.linalg.det(pose[:, :3]) < 0:
-        raise unusable(
-            "sfm.pose-mirrors", f"the transform_matrix of frame {name!r}", "it mirrors (its determinant is negative)"
+        raise StageError(
+            "sfm.pose-mirrors",
+            f"cannot use {what}",
+            "it mirrors (its determinant is negative), as poses of a left-handed world do, and a camera with one axis "
+            "the wrong way",
+            "Negate one row of every matrix if the world is left-handed (Unity, Unreal), else the column of that axis.",
         )
     rotation = _nearest_rotation(pose[:, :3])
     if not rotation.stretch_deg <= MAX_STRETCH_DEG:
-        why = (
-            f"it is no rotation: its axes are off by {rotation.stretch_deg:.2g}°, and it scales by {rotation.scale:.4g}"
-        )
-        raise unusable("sfm.pose-no-rotation", f"the transform_matrix of frame {name!r}", why)
+        off = f"its axes are off by {rotation.stretch_deg:.2g}°, and it scales by {rotation.scale:.4g}"
+        why = f"it is no rotation: {off if rotation.scale > 0 else 'its determinant is 0'}"
+        raise unusable("sfm.pose-no-rotation", what, why)
     return np.concatenate([rotation.matrix, pose[:, 3:]], axis=1), rotation
 
 
@@ -358,9 +440,10 @@ def _from_llff(
     upright = any(fits_only_upright(one.camera, photo) for photo, one in of)
     posed = []
     for photo, one in sorted(of, key=lambda pair: pair[0].image_name):
-        matrix, _ = _rigid(one.world_from_camera, photo.name)
+        where = f"the row of {file.name} for {photo.name!r}"
+        matrix, _ = _rigid(one.world_from_camera, where)
         pose = world_from_camera(matrix, convention)
-        posed.append(posed_photo(photo, photo.name, one.camera, pose, upright))
+        posed.append(posed_photo(photo, photo.name, where, one.camera, pose, upright))
     left_out = without_rays(posed)
     model = SparseModel.without_points(*distinct([one for one in posed if one.file not in left_out]))
     return ImportedPoses(model, left_out, None, _notes((), (), posed, left_out))
@@ -373,7 +456,7 @@ def _from_colmap(folder: Path, photos: Sequence[Photo], convention: PoseConventi
     given = _with_slashes(read_model(folder), photos)
     photo_of = _by_name([image.file for image in given.images], photos)
     if not photo_of:
-        raise _nothing_matches(folder.name, [image.file for image in given.images], photos)
+        raise _nothing_matches(str(folder), [image.file for image in given.images], photos)
     upright = _is_of_upright_photos(folder, given, photo_of)
     posed = {}
     for i in sorted(photo_of, key=lambda i: photo_of[i].image_name):
@@ -381,7 +464,8 @@ def _from_colmap(folder: Path, photos: Sequence[Photo], convention: PoseConventi
         pose = image.sfm_from_camera
         if convention != OF_COLMAP:
             pose = world_from_camera(inverse(pose), convention)
-        posed[i] = posed_photo(photo_of[i], image.file, given.cameras[image.camera], pose, upright)
+        where = f"{image.file!r} of {folder}"
+        posed[i] = posed_photo(photo_of[i], image.file, where, given.cameras[image.camera], pose, upright)
     left_out = without_rays(posed.values())
     kept = {i: one for i, one in posed.items() if one.file not in left_out}
     pixel_maps = [
@@ -396,11 +480,11 @@ def _from_colmap(folder: Path, photos: Sequence[Photo], convention: PoseConventi
         posed.values(),
         left_out,
     )
-    if others := [pair for one in kept.values() if (pair := _other_ending(one.name, one.photo))]:
+    if others := [pair for one in kept.values() if (pair := _other_spelling(one.name, one.photo))]:
         notes.append(
             Note(
-                "sfm.other-endings",
-                f"{len(others)} photos have the cameras of files with another ending: {_few(others)}",
+                "sfm.other-spellings",
+                f"{len(others)} photos have the cameras of files whose names are spelt otherwise: {_few(others)}",
             )
         )
     if not len(given.xyz):
@@ -437,7 +521,7 @@ def _is_of_upright_photos(folder: Path, given: SparseModel, photo_of: Mapping[in
 def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
     """Photo by index of its image: of the same name, else of the name that ingest gave it, else of a name whose
     accents are composed in another way, else of the same name below a folder that all have, else of the same end, else
-    of the same name but for its ending."""
+    of the same name but for its ending, else but for small and capital letters."""
     found: dict[int, Photo] = {}
     taken: set[str] = set()
     by_own, by_given = {photo.name: photo for photo in photos}, {photo.image_name: photo for photo in photos}
@@ -448,7 +532,7 @@ def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
         _by_folder(names, photos),
         _by_end(names, photos),
     )
-    for photo_of in (*candidates, _by_key(names, photos, _without_ending)):
+    for photo_of in (*candidates, _by_key(names, photos, _without_ending), _by_key(names, photos, _without_case)):
         for index, name in enumerate(names):
             photo = photo_of.get(name)
             if photo is not None and index not in found and photo.name not in taken:
@@ -509,8 +593,8 @@ def _by_key(names: Sequence[str], photos: Sequence[Photo], key: Callable[[str], 
     return {name: by_key[key_of] for name in names if images[key_of := key(name)] == 1 and key_of in by_key}
 
 
-def _other_ending(name: str, photo: Photo) -> str | None:
-    """A photo and its image in words, where their endings differ."""
+def _other_spelling(name: str, photo: Photo) -> str | None:
+    """A photo and its image in words, where their names differ by more than folders and accents."""
     same = name == photo.image_name or _last(name) == _last(photo.name)
     return None if same else f"{photo.name} ({name})"
 
@@ -527,16 +611,21 @@ def _without_ending(name: str) -> str:
     return os.path.splitext(_composed(name))[0]
 
 
+def _without_case(name: str) -> str:
+    return _composed(name).casefold()
+
+
 # --- both
 
 
 def _nothing_matches(source: str, names: Sequence[str], photos: Sequence[Photo]) -> StageError:
     here = _few([photo.name for photo in photos], MAX_NAMES_OF_ERROR)
+    its = f"it has cameras of {_few(names, MAX_NAMES_OF_ERROR)}" if names else "it has no cameras"
     return StageError(
         "sfm.no-camera-matches",
         f"no camera in {source} belongs to a photo",
-        f"it is of {_few(names, MAX_NAMES_OF_ERROR)}, and the photos are {here}",
-        "Give the folder of the photos that these cameras belong to.",
+        f"{its}, and the photos are {here}",
+        "Give the folder of the photos that these cameras belong to, under the names that they had then.",
     )
 
 

@@ -14,7 +14,7 @@ from stages.sfm.colmap.cameras import native, no_ray, rescaled, share_without_ra
 from stages.sfm.imported.orientation import QUARTER_TURNS, is_of_stored_pixels, same_shape, turned_camera, turned_pose
 from stages.sfm.imported.transforms_intrinsics import why_unusable
 
-HINT = "Correct the file, or leave the cameras out to have them found from the photos."
+HINT = "Correct that and run again, or leave the cameras out, and they are found from the photos: pipeline run FOLDER"
 
 
 @dataclass(frozen=True)
@@ -34,33 +34,34 @@ class PosedPhoto:
 
 
 def posed_photo(
-    photo: Photo, name: str, camera: Camera, world_from_camera: Float[np.ndarray, "3 4"], upright: bool
+    photo: Photo, name: str, where: str, camera: Camera, world_from_camera: Float[np.ndarray, "3 4"], upright: bool
 ) -> PosedPhoto:
     """A camera, given under ``name``, as one of the upright photo; ``upright`` is as :func:`is_of_stored_pixels` has
-    it. Raises StageError, with the name, for a camera that is none and for another shape than the photo's."""
-    turns = _turns(photo, camera, name, upright)
-    camera = _at_size_of(photo, turned_camera(camera, turns), name)
+    it. Raises StageError, saying ``where`` it stands, for a camera that is none and for another shape than the
+    photo's."""
+    turns = _turns(photo, camera, where, upright)
+    camera = _at_size_of(photo, turned_camera(camera, turns), where)
     return PosedPhoto(photo, name, camera, turned_pose(world_from_camera, turns), turns)
 
 
-def _turns(photo: Photo, camera: Camera, name: str, upright: bool) -> int:
+def _turns(photo: Photo, camera: Camera, where: str, upright: bool) -> int:
     """How many quarter turns clockwise make an imported camera one of the upright photo. Raises StageError for a camera
     that is none, and where the photo was mirrored, which no camera can be."""
     if why_degenerate := why_unusable(camera):
-        raise unusable("sfm.degenerate-camera", f"the camera of {name!r}", why_degenerate)
+        raise unusable("sfm.degenerate-camera", f"the camera of {where}", why_degenerate)
     if not is_of_stored_pixels(camera, photo, upright):
         return 0
     if photo.orientation not in QUARTER_TURNS:
         raise StageError(
             "sfm.mirrored-photo",
-            f"cannot use the camera of {name!r}",
+            f"cannot use the camera of {where}",
             f"the EXIF orientation {photo.orientation} of {photo.name} mirrors the photo, which no camera pose can do",
             "Leave the cameras out, or make them for photos that are saved upright, without an EXIF orientation.",
         )
     return QUARTER_TURNS[photo.orientation]
 
 
-def _at_size_of(photo: Photo, camera: Camera, name: str) -> Camera:
+def _at_size_of(photo: Photo, camera: Camera, where: str) -> Camera:
     """``camera`` rescaled where the photo has another size. Raises StageError where it has another shape, too."""
     size = (photo.width, photo.height)
     if (camera.width, camera.height) == size:
@@ -68,7 +69,7 @@ def _at_size_of(photo: Photo, camera: Camera, name: str) -> Camera:
     if not same_shape(camera, size):
         raise unusable(
             "sfm.photo-shape",
-            f"the camera of {name!r}",
+            f"the camera of {where}",
             f"it is for {camera.width}×{camera.height} pixels, the photo has {photo.width}×{photo.height}",
         )
     return rescaled(camera, *size)

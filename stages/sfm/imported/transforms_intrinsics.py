@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from nerf.geometry.scene import Camera
+from stages.contract import listed
 from stages.io.colmap_files import MAX_SIDE
 from stages.sfm.colmap.cameras import focal_lengths_and_centre
 
 # Focal lengths in widths of the picture: from 179° across to 20 seconds of arc, a telescope's.
 FOCAL_RATIOS = (0.005, 10_000.0)
+MIN_FOCAL_PX = 10.0  # less is a length in widths, or in millimetres
 MAX_CENTRE_OFFSET = 100.0  # in widths: where the principal point of the last corner cut out of a large picture may lie
 MAX_LETTERS = 40  # of a value, in an error
 FISHEYE, PRISM, RATIONAL, PANORAMA = "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "FULL_OPENCV", "EQUIRECTANGULAR"
@@ -26,7 +28,16 @@ FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 CENTRE = ("cx", "cy")
 DISTORTION = ("distortion_params", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
 CAMERA_MODEL = ("camera_model", "is_fisheye", *OTHER_CAMERA_MODELS)
+SIZE = ("w", "h")
+OF_INTRINSICS = {*FOCAL, *CENTRE, *DISTORTION, *CAMERA_MODEL, *SIZE}
+IN_PIXELS = {"fl_x": "w", "fl_y": "h", "cx": "w", "cy": "h"}  # of a picture of that side
+# How other programs spell these keys, and where they keep them: in a block of their own, or as a matrix.
+SPELLINGS = {"fx": "fl_x", "fy": "fl_y", "width": "w", "height": "h"}
+BLOCKS = ("camera", "intrinsics", "camera_intrinsics", "intrinsic_matrix", "camera_matrix", "K")
 SAME_WITHIN = 0.01  # two focal lengths, relatively: files are rounded
+MAX_SKEW = 1e-3  # of a focal length: what rounding leaves
+MAX_KEYS = 5  # in an error
+NOT_OF_CAMERAS = {"file_path", "transform_matrix", "frames", "photo", "mask_path"}
 
 
 def intrinsics_of(frame: Mapping[str, Any], file: Mapping[str, Any]) -> dict[str, Any]:
@@ -34,20 +45,67 @@ def intrinsics_of(frame: Mapping[str, Any], file: Mapping[str, Any]) -> dict[str
     the frame does not have. A value that is null counts as absent.
 
     A frame's ``camera_angle_x`` so overrules the ``fl_x`` of its file. Distortion belongs to a camera model: where the
-    frame declares another one than the file, the file's terms are not the frame's.
+    frame declares another one than the file, the file's terms are not the frame's. Pixels are those of the file's ``w``
+    and ``h``: a frame of another size and the same shape has them rescaled. Raises ValueError as
+    :func:`with_usual_names` does.
     """
-    own, shared = ({key: value for key, value in of.items() if value is not None} for of in (frame, file))
+    own, shared = with_usual_names(frame), with_usual_names(file)
     other_model = any(key in own and own[key] != shared.get(key, False) for key in CAMERA_MODEL)
     for group in (FOCAL, CENTRE, DISTORTION, CAMERA_MODEL):
         if not own.keys().isdisjoint(group) or (group is DISTORTION and other_model):
             shared = {key: value for key, value in shared.items() if key not in group}
-    return shared | own
+    return _rescaled(shared, own) | own
+
+
+def _rescaled(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """What a file says in pixels, for a frame that has a size of its own."""
+    try:
+        scales = {side: float(own.get(side, shared[side])) / float(shared[side]) for side in SIZE}
+        pixels = {key: float(shared[key]) * scales[side] for key, side in IN_PIXELS.items() if key in shared}
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):  # no size, or none that is one
+        return dict(shared)
+    is_same_shape = abs(scales["w"] - scales["h"]) <= SAME_WITHIN * abs(scales["h"])
+    return {**shared, **pixels} if is_same_shape and scales["w"] != 1 else dict(shared)
+
+
+def with_usual_names(values: Mapping[str, Any]) -> dict[str, Any]:
+    """What a frame or a file holds but for nulls, with intrinsics under the names that nerfstudio and instant-ngp use.
+    Raises ValueError for a matrix that is none of intrinsics."""
+    blocks = [_of_block(name, values[name]) for name in BLOCKS if values.get(name) is not None]
+    found: dict[str, Any] = {}
+    for level in (*blocks, values):
+        spelt = {SPELLINGS[key]: value for key, value in level.items() if key in SPELLINGS and value is not None}
+        found |= spelt | {key: value for key, value in level.items() if value is not None}
+    return found
+
+
+def _of_block(name: str, block: Any) -> dict[str, Any]:
+    """The intrinsics that a block of a file holds, or a matrix of them, row by row or column by column."""
+    if isinstance(block, Mapping):
+        known = OF_INTRINSICS | SPELLINGS.keys()
+        return {key: value for key, value in block.items() if key in known}
+    if not isinstance(block, list):
+        return {}
+    numbers = [number for row in block for number in (row if isinstance(row, list) else [row])]
+    values = np.array([_finite(number, name) for number in numbers])
+    if len(values) == 4:
+        fx, fy, cx, cy = values
+        return {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+    if len(values) not in (9, 12, 16):
+        raise ValueError(f"its {name} has {len(values)} numbers, not the 3 × 3 of a camera matrix")
+    matrix = values.reshape(len(values) // (3 if len(values) == 9 else 4), -1)[:3, :3]
+    matrix = matrix.T if matrix[2, :2].any() else matrix
+    if matrix[2].tolist() != [0, 0, 1] or matrix[1, 0] or abs(matrix[0, 1]) > MAX_SKEW * abs(matrix[0, 0]):
+        rows = "; ".join(" ".join(f"{value:.4g}" for value in row) for row in matrix)
+        raise ValueError(f"its {name} is no camera matrix of fx, 0, cx; 0, fy, cy; 0, 0, 1: {rows}")
+    return {"fl_x": matrix[0, 0], "fl_y": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
 
 
 def contradictions(values: Mapping[str, Any], width: int, height: int) -> list[str]:
     """What a frame or a file says twice and not alike, and which is taken. Values that are no numbers are not compared:
     :func:`read_intrinsics` refuses those that it reads."""
     found = []
+    values = with_usual_names(values)
     for axis, size in (("x", values.get("w") or width), ("y", values.get("h") or height)):
         try:
             focal = _focal_lengths(values, axis, float(size))
@@ -57,6 +115,8 @@ def contradictions(values: Mapping[str, Any], width: int, height: int) -> list[s
         for name, other in others:
             if abs(other - pixels) > SAME_WITHIN * abs(pixels):
                 found.append(f"{taken} is {pixels:.5g} pixels and {name} says {other:.5g}: {taken} is taken")
+        if taken == (name := f"{axis}_fov") and (angle := float(values[name])) < math.pi:
+            found.append(f"{name} is {angle:.4g} and read as degrees: if it is radians, call it camera_angle_{axis}")
     terms = values.get("distortion_params")
     if isinstance(terms, list) and len(terms) == len(NERFSTUDIOS):
         other = [name for name, term in zip(NERFSTUDIOS, terms, strict=True) if values.get(name, term) != term]
@@ -87,7 +147,7 @@ def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: f
     along = _focal_length(values, "x", w), _focal_length(values, "y", h)
     given = [one for one in along if one is not None] or [focal * max(w, h)] * (focal > 0)
     if not given:
-        raise ValueError("no focal length in it: neither fl_x nor camera_angle_x (between 0 and π)")
+        raise ValueError(_why_no_focal_length(values))
     fx, fy = (given[0] if one is None else one for one in along)
     pinhole = (fx, fy, number("cx", w / 2), number("cy", h / 2))
     k = [number(f"k{i}", 0.0) for i in range(1, 7)]
@@ -97,6 +157,19 @@ def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: f
     if why_degenerate := why_unusable(camera):
         raise ValueError(why_degenerate)
     return camera
+
+
+def _why_no_focal_length(values: Mapping[str, Any]) -> str:
+    wide = [(key, values[key]) for key in FOCAL if key in values]
+    if wide:
+        key, angle = wide[0]
+        most = (
+            "radians, between 0 and π: degrees are called x_fov" if key.startswith("camera") else "degrees, below 180"
+        )
+        return f"its {key} is {repr(angle)[:MAX_LETTERS]} and should be in {most}"
+    others = sorted(values.keys() - OF_INTRINSICS - NOT_OF_CAMERAS)
+    there = f"; what it has is {listed(others, MAX_KEYS)}" if others else ""
+    return f"no focal length in it: neither fl_x (pixels) nor camera_angle_x (radians) nor x_fov (degrees){there}"
 
 
 def why_unusable(camera: Camera) -> str | None:
@@ -109,7 +182,8 @@ def why_unusable(camera: Camera) -> str | None:
     longer = max(camera.width, camera.height)
     if not all(FOCAL_RATIOS[0] <= value / longer <= FOCAL_RATIOS[1] for value in focal):
         pixels = " × ".join(f"{value:.5g}" for value in focal)
-        return f"a focal length of {pixels} pixels is not one for a picture of {camera.width}×{camera.height}"
+        why = f"a focal length of {pixels} pixels is not one for a picture of {camera.width}×{camera.height}"
+        return f"{why}; it may be in widths of the picture or in millimetres" if 0 < max(focal) < MIN_FOCAL_PX else why
     if max(map(abs, centre), default=0.0) > MAX_CENTRE_OFFSET * longer:
         at = ", ".join(f"{value:.5g}" for value in centre)
         return f"its principal point ({at}) is far outside of its {camera.width}×{camera.height} pixels"

@@ -189,6 +189,8 @@ def test_a_transforms_file_that_was_written_on_windows(tmp_path: Path) -> None:
     cameras.write_bytes(b"\xef\xbb\xbf" + cameras.read_bytes())
     photos = ["train/0001.png", "train/0002.png", "train\\0002.png", "gone\\0.png"]
     assert list(find_source(cameras).frames.values()) == photos
+    cameras.write_text(cameras.read_text("utf-8-sig"), "utf-16")  # as PowerShell redirects
+    assert list(find_source(cameras).frames.values()) == photos
     error = refusal(transforms(tmp_path / "transforms.json", "..\\secret.jpg"))
     assert (error.what, error.why) == ("rejected the photo '../secret.jpg'", f"it leads out of the folder {tmp_path}")
 
@@ -210,8 +212,13 @@ def test_frames_may_not_leave_their_folder(tmp_path: Path, file_path: str) -> No
         ("{", "it is not JSON"),
         ("[1]", "it has no list named 'frames'"),
         ('{"frames": []}', "its list 'frames' is empty"),
-        ('{"frames": [{"file_path": "a.jpg"}]}', "frame 0 lacks file_path or transform_matrix"),
-        ('{"frames": [{"file_path": 3, "transform_matrix": []}]}', "frame 0 lacks file_path or transform_matrix"),
+        ('{"frames": [{"file_path": "a.jpg"}]}', "frame 0 has no transform_matrix: it has file_path"),
+        ('{"frames": [{"path": 1, "c2w": 2}]}', "frame 0 has no file_path and no transform_matrix: it has path, c2w"),
+        (
+            '{"frames": [{"file_path": 3, "transform_matrix": []}]}',
+            "the file_path of frame 0 is 3, and no name of a file",
+        ),
+        ('{"frames": ["a.jpg"]}', "frame 0 is 'a.jpg', and no object with file_path and transform_matrix"),
         ("[" * 100_000, "it is not JSON"),
     ],
 )

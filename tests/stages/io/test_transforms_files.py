@@ -87,7 +87,10 @@ def test_test_frames_of_one_file_are_test_photos(tmp_path: Path) -> None:
     found = read_poses(file, PHOTOS, NAMES)
     assert found.test_files is None
     assert found.notes[-1].code == REPEATS
-    for wrong, why in (({}, "it is no list"), ([{}], "frame 0 lacks file_path or transform_matrix")):
+    for wrong, why in (
+        ({}, "it is no list"),
+        ([{}], "frame 0 has no file_path and no transform_matrix: it has nothing"),
+    ):
         file.write_text(json.dumps({**LENS, "frames": TRAIN, "test_frames": wrong}))
         with pytest.raises(StageError) as raised:
             read_poses(file, PHOTOS, NAMES)

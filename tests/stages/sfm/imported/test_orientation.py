@@ -12,6 +12,7 @@ from PIL import Image
 
 from nerf.geometry.scene import Camera
 from stages import ingest, normalise, sfm
+from stages.contract import run_stage
 from stages.ingest.decoding import upright
 from stages.io.colmap_files import PARAMETERS
 from stages.io.photos import Photo, read_photos
@@ -19,7 +20,7 @@ from stages.io.pixels import load_pixels
 from stages.io.sparse_model import SparseImage, SparseModel
 from stages.sfm.colmap.cameras import camera_rays, project
 from stages.sfm.colmap.models import read_model, write_model
-from stages.sfm.imported.orientation import QUARTER_TURNS, pixel_map, turned_camera, turned_pose
+from stages.sfm.imported.orientation import QUARTER_TURNS, pixel_map, same_shape, turned_camera, turned_pose
 from stages.sfm.imported.pose_files import ImportedPoses, read_poses
 from tests.camera_layouts import ring
 from tests.refusals import codes, refused
@@ -91,7 +92,7 @@ def frames_of(names: list[str]) -> list[dict[str, Any]]:
 def imported(cameras: Path, photos: Path, folder: Path, progress: Any) -> tuple[SparseModel, np.ndarray]:
     """The cameras as stage sfm leaves them, and the first photo's pixels as ingest does."""
     ingest.run(ingest.Config(photos=photos, cameras=cameras), {}, folder / "ingest", progress)
-    sfm.run(sfm.Config(cameras=cameras), {"ingest": folder / "ingest"}, folder / "sfm", progress)
+    run_stage(sfm, sfm.Config(cameras=cameras), {"ingest": folder / "ingest"}, folder / "sfm", progress)
     first = read_photos(folder / "ingest")[0]
     return read_model(folder / "sfm/sparse"), load_pixels(folder / "ingest" / first.file, first.width, first.height)
 
@@ -178,6 +179,15 @@ def read_one(folder: Path, taken: Photo, **values: Any) -> ImportedPoses:
     frame = {"file_path": "p.jpg", "transform_matrix": np.eye(4).tolist()}
     file.write_text(json.dumps({**LENS, "frames": [frame | values]}))
     return read_poses(file, [taken], {"p.jpg": taken.name})
+
+
+@pytest.mark.parametrize("factor", [1, 2, 4, 7])
+def test_reduced_photos_have_whole_pixels(factor: int) -> None:
+    camera = Camera("SIMPLE_PINHOLE", 400, 267, (300.0, 200.0, 133.5))
+    width, height = 400 / factor, 267 / factor
+    for size in ((math.floor(width), math.floor(height)), (round(width), math.ceil(height))):
+        assert same_shape(camera, size)
+    assert not same_shape(camera, (round(width), round(height) + math.ceil(10 / factor)))
 
 
 @pytest.mark.parametrize("orientation", [2, 4, 5, 7])

@@ -121,6 +121,44 @@ def test_intrinsics(read, values: dict[str, Any], expected: tuple[str, tuple[flo
     assert camera.params == pytest.approx(expected[1])
 
 
+MATRIX = [[50.0, 0, 31], [0, 52, 19], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    "spelt",
+    [
+        {"fx": 50.0, "fy": 52.0, "cx": 31.0, "cy": 19.0, "width": W, "height": H},
+        {"intrinsics": LENS},
+        {"camera": LENS | {"name": "phone"}},
+        {"camera": {"fx": 50.0, "fy": "52", "cx": 31.0, "cy": 19.0, "width": W, "height": H}},
+        {"intrinsics": MATRIX},
+        {"K": np.ravel(MATRIX).tolist()},
+        {"K": np.transpose(MATRIX).ravel().tolist()},  # column by column, as ARKit has it
+        {"camera_intrinsics": [50, 52, 31, 19]},
+        {"intrinsic_matrix": np.pad(MATRIX, (0, 1)).tolist()},
+        {"intrinsics": LENS, "K": None, "fx": None},
+        {"fx": 99.0, "K": np.eye(3).tolist()} | LENS,
+    ],
+)
+def test_intrinsics_in_other_spellings(read, spelt: dict[str, Any]) -> None:
+    """Of a frame they go before the file's, too."""
+    alone = read([frame(i) for i in range(3)], **spelt)
+    (camera,) = alone.model.cameras
+    assert (camera.model, camera.params) == ("PINHOLE", pytest.approx((50, 52, 31, 19)))
+    mixed = read([frame(0), frame(1, **spelt), frame(2)], fl_x=99.0, cx=1.0, cy=2.0)
+    assert mixed.model.cameras[1].params == pytest.approx((50, 52, 31, 19))
+
+
+@pytest.mark.parametrize(("size", "scale"), [((W // 2, H // 2), 0.5), ((2 * W, 2 * H), 2.0), ((W, H // 2), 1.0)])
+def test_pixels_of_the_file_are_of_its_size(read, size: tuple[int, int], scale: float) -> None:
+    photos = [photo(0), photo(1, *size), photo(2)]
+    own = frame(1, w=size[0], h=size[1])
+    known = read([frame(0), own, frame(2)], photos=photos, w=W, h=H, k1=0.1, **LENS)
+    camera = known.model.cameras[known.model.images[1].camera]
+    assert (camera.width, camera.height) == size
+    assert camera.params[:5] == pytest.approx([*(scale * value for value in LENS.values()), 0.1])
+
+
 def test_a_frames_own_intrinsics_win(read) -> None:
     model = read([frame(0), frame(1, fl_x=70.0), frame(2)], **LENS).model
     assert [camera.params[0] for camera in model.cameras] == [50, 70]
@@ -161,6 +199,7 @@ def test_a_frame_has_each_group_of_intrinsics_whole(read, own: dict[str, Any], e
     [
         ({"fl_x": 70.0, "camera_angle_x": ANGLE}, {}, ["./1", "fl_x", "70", "camera_angle_x", "120"]),
         ({}, {"x_fov": math.degrees(ANGLE)}, ["all frames", "fl_x", "50", "x_fov", "120"]),
+        ({"x_fov": 1.1}, {}, ["./1", "x_fov", "1.1", "degrees", "camera_angle_x"]),
         ({"k1": 0.2, "distortion_params": [0.1, 0, 0, 0, 0, 0]}, {}, ["./1", "k1", "distortion_params"]),
         ({}, {"camera_model": "PINHOLE", "is_fisheye": True}, ["all frames", "PINHOLE", "is_fisheye"]),
     ],
@@ -181,67 +220,81 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"transform_matrix": _with(0, 3, math.nan)}, r"frame './1': its transform_matrix is not 4 × 4"),
-        ({"transform_matrix": _with(1, 1, math.inf)}, r"frame './1': its transform_matrix is not 4 × 4"),
-        ({"transform_matrix": [[1, 0], [0, 1]]}, r"frame './1': its transform_matrix is not 4 × 4"),
-        ({"transform_matrix": [[1, 0], ["x"]]}, r"frame './1': its transform_matrix is not a matrix of numbers"),
-        ({"transform_matrix": 7}, r"frame './1': its transform_matrix is not 4 × 4"),
-        ({"transform_matrix": (matrix(1) @ np.diag([-1, 1, 1, 1])).tolist()}, r"frame './1': it mirrors"),
+        ({"transform_matrix": _with(1, 1, math.inf)}, r"its transform_matrix is not 4 × 4"),
+        ({"transform_matrix": [[1, 0], [0, 1]]}, r"its transform_matrix is not 4 × 4"),
+        ({"transform_matrix": [[1, 0], ["x"]]}, r"its transform_matrix is not a matrix of numbers"),
+        ({"transform_matrix": 7}, r"its transform_matrix is not 4 × 4"),
+        ({"transform_matrix": (matrix(1) @ np.diag([-1, 1, 1, 1])).tolist()}, r"it mirrors"),
         (
             {"transform_matrix": (matrix(1) @ np.diag([2, 2, 3, 1])).tolist()},
             r"its axes are off by 12°, and it scales by",
         ),
         ({"transform_matrix": matrix(1).round(2).tolist()}, r"no rotation: its axes are off by 0\.\d+°"),
-        ({"transform_matrix": np.zeros((4, 4)).tolist()}, r"its axes are off by inf°, and it scales by 0\."),
+        ({"transform_matrix": np.diag([1, 1, 0, 1]).tolist()}, r"it is no rotation: its determinant is 0"),
         (
             {"transform_matrix": matrix(1).T.tolist()},
             r"the last row .* is 1, 2, -1, 1 and not 0, 0, 0, 1: it may be trans",
         ),
-        ({"fl_x": 0}, r"camera of frame './1': a focal length of 0 × 0 pixels is not one for a picture of 60×40"),
-        ({"fl_x": -50}, r"camera of frame './1': a focal length of -50 × -50 pixels is not one"),
-        ({"fl_x": 1e308}, r"camera of frame './1': a focal length of 1e\+308 × 1e\+308 pixels is not one"),
-        ({"fl_x": 1e-300}, r"camera of frame './1': a focal length of 1e-300 × 1e-300 pixels is not one"),
-        ({"fl_x": 10**400}, r"camera of frame './1': its fl_x is 10{39}, not a finite number"),
-        ({"cx": -1e300}, r"camera of frame './1': its principal point \(-1e\+300, 20\) is far outside of its 60×40"),
-        ({"w": 10**30, "h": 10**30}, r"camera of frame './1': its w and h are 1e\+30 and 1e\+30"),
-        ({"transform_matrix": _with(0, 3, 1e300)}, r"frame './1': its position is 1e\+300 units from the origin"),
-        ({"transform_matrix": _with(0, 0, 1e308)}, r"frame './1': it is no rotation: 1e\+308 is in it"),
-        ({"transform_matrix": _with(0, 0, 10**400)}, r"frame './1': its transform_matrix is not a matrix of numbers"),
-        ({"fl_x": math.nan}, r"camera of frame './1': its fl_x is nan, not a finite number"),
-        ({"cx": "31 px"}, r"camera of frame './1': its cx is '31 px', not a finite number"),
-        ({"cx": [31]}, r"camera of frame './1': its cx is \[31\], not a finite number"),
-        ({"k1": "nan"}, r"camera of frame './1': its k1 is 'nan', not a finite number"),
-        ({"k1": True}, r"camera of frame './1': its k1 is True, not a finite number"),
-        ({"w": 0, "h": 0}, r"camera of frame './1': its w and h are 0 and 0"),
-        ({"w": 80, "h": 40}, r"camera of './1': it is for 80×40 pixels, the photo has 60×40"),
-        ({"k4": 0.1}, r"camera of frame './1': it has a k4, and its camera_model is not FULL_OPENCV"),
-        ({"camera_model": "EQUIRECTANGULAR"}, r"camera of frame './1': panoramas are not supported"),
-        ({"camera_model": "FISHEYE624"}, r"frame './1': its camera_model is 'FISHEYE624', which is none of SIMPLE_PIN"),
-        ({"camera_model": "ORTHOPHOTO"}, r"frame './1': its camera_model is 'ORTHOPHOTO', which is none of"),
-        ({"camera_model": "VR180_L"}, r"frame './1': its camera_model is 'VR180_L', which is none of"),
+        ({"camera_angle_x": 40, "fl_x": None}, r"its camera_angle_x is 40 and should be in radians, between 0"),
+        ({"intrinsics": [[50, 0, 31], [0, 50, 19]]}, r"its intrinsics has 6 numbers, not the 3 × 3"),
+        ({"intrinsics": [50, 9, 31, 0, 50, 19, 0, 0, 1]}, r"its intrinsics is no camera matrix .*: 50 9 31; 0 50"),
+        ({"fl_x": 0}, r"a focal length of 0 × 0 pixels is not one for a picture of 60×40"),
+        ({"fl_x": -50}, r"a focal length of -50 × -50 pixels is not one"),
+        ({"fl_x": 1e308}, r"a focal length of 1e\+308 × 1e\+308 pixels is not one"),
+        ({"fl_x": 1e-300}, r"a focal length of 1e-300 × 1e-300 pixels is not one"),
+        ({"fl_x": 10**400}, r"its fl_x is 10{39}, not a finite number"),
+        ({"cx": -1e300}, r"its principal point \(-1e\+300, 20\) is far outside of its 60×40"),
+        ({"w": 10**30, "h": 10**30}, r"its w and h are 1e\+30 and 1e\+30"),
+        ({"transform_matrix": _with(0, 3, 1e300)}, r"its position is 1e\+300 units from the origin"),
+        ({"transform_matrix": _with(0, 0, 1e308)}, r"it is no rotation: 1e\+308 is in it"),
+        ({"transform_matrix": _with(0, 0, 10**400)}, r"its transform_matrix is not a matrix of numbers"),
+        ({"fl_x": math.nan}, r"its fl_x is nan, not a finite number"),
+        ({"cx": "31 px"}, r"its cx is '31 px', not a finite number"),
+        ({"cx": [31]}, r"its cx is \[31\], not a finite number"),
+        ({"k1": "nan"}, r"its k1 is 'nan', not a finite number"),
+        ({"k1": True}, r"its k1 is True, not a finite number"),
+        ({"w": 0, "h": 0}, r"its w and h are 0 and 0"),
+        ({"w": 80, "h": 40}, r"it is for 80×40 pixels, the photo has 60×40"),
+        ({"k4": 0.1}, r"it has a k4, and its camera_model is not FULL_OPENCV"),
+        ({"camera_model": "EQUIRECTANGULAR"}, r"panoramas are not supported"),
+        ({"camera_model": "FISHEYE624"}, r"its camera_model is 'FISHEYE624', which is none of SIMPLE_PIN"),
+        ({"camera_model": "ORTHOPHOTO"}, r"its camera_model is 'ORTHOPHOTO', which is none of"),
+        ({"camera_model": "VR180_L"}, r"its camera_model is 'VR180_L', which is none of"),
         ({"camera_model": "RAD_TAN_THIN_PRISM_FISHEYE"}, r"its camera_model is 'RAD_TAN_THIN_PRISM_FISHEYE', which is"),
-        ({"camera_model": ["OPENCV"]}, r"frame './1': its camera_model is \['OPENCV'\], which is none of"),
-        ({"ftheta_p0": 0.0}, r"frame './1': it has ftheta_p0: camera models of that kind are not supported"),
-        ({"latlong": True}, r"frame './1': it has latlong: camera models of that kind are not supported"),
+        ({"camera_model": ["OPENCV"]}, r"its camera_model is \['OPENCV'\], which is none of"),
+        ({"ftheta_p0": 0.0}, r"it has ftheta_p0: camera models of that kind are not supported"),
+        ({"latlong": True}, r"it has latlong: camera models of that kind are not supported"),
         (
             {"equirectangular": True},
-            r"frame './1': it has equirectangular: camera models of that kind are not supported",
+            r"it has equirectangular: camera models of that kind are not supported",
         ),
-        ({"distortion_params": [0.1, 0.2]}, r"frame './1': its distortion_params are not six numbers, k1, k2, k3, k4"),
-        ({"distortion_params": [0.1, 0, 0, 0, 0, None]}, r"frame './1': its p2 is None, not a finite number"),
-        ({"distortion_params": [0, 0, 0, 0.1, 0, 0]}, r"frame './1': it has a k4, and its camera_model is not FULL_"),
-        ({"is_fisheye": True, "k5": 0.1}, r"frame './1': it has a k5 or k6, and is a fisheye"),
-        ({"sx1": 0.1}, r"frame './1': it has sx1 or sy1, and its camera_model is not THIN_PRISM_FISHEYE"),
+        ({"distortion_params": [0.1, 0.2]}, r"its distortion_params are not six numbers, k1, k2, k3, k4"),
+        ({"distortion_params": [0.1, 0, 0, 0, 0, None]}, r"its p2 is None, not a finite number"),
+        ({"distortion_params": [0, 0, 0, 0.1, 0, 0]}, r"it has a k4, and its camera_model is not FULL_"),
+        ({"is_fisheye": True, "k5": 0.1}, r"it has a k5 or k6, and is a fisheye"),
+        ({"sx1": 0.1}, r"it has sx1 or sy1, and its camera_model is not THIN_PRISM_FISHEYE"),
     ],
 )
 def test_what_is_no_camera_is_refused_by_name(read, changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(StageError, match=message):
-        read([frame(0), frame(1, **changes), frame(2)], **LENS)
+    lens = {} if changes.get("fl_x", 1) is None else LENS
+    with pytest.raises(StageError, match=message) as raised:
+        read([frame(0, fl_x=50.0), frame(1, **changes), frame(2)], **lens)
+    assert "frame './1' of transforms.json" in raised.value.what
 
 
 def test_no_focal_length_at_all_is_refused(read) -> None:
-    with refused("sfm.frame-intrinsics", "./0", "fl_x", "camera_ang"):
-        read([frame(0, camera_angle_x=40)])
+    with refused("sfm.frame-intrinsics", "./0", "transforms.json", "fl_x", "camera_angle_x", "focal_length, lens"):
+        read([frame(0, focal_length=35.0, lens="wide")])
+
+
+@pytest.mark.parametrize("none", [None, np.zeros((4, 4)).tolist(), [math.nan] * 16, _with(0, 3, math.nan)])
+def test_frames_without_a_pose_are_left_out_and_named(read, none: Any) -> None:
+    known = read([frame(0), frame(1, transform_matrix=none), frame(2)], **LENS)
+    assert [image.file for image in known.model.images] == ["a0.png", "a2.png"]
+    assert codes(known.notes) == ["sfm.frames-without-pose"] and "ä1.png" in known.notes[0].text
+    assert known.left_out == {"a1.png": "its frame has no pose"}
+    with refused("sfm.no-poses", "transforms.json", "all 3 frames"):
+        read([frame(i, transform_matrix=none) for i in range(3)], **LENS)
 
 
 def test_rounded_rotations_are_projected_and_named(read) -> None:
@@ -329,6 +382,14 @@ def test_a_matrix_may_be_a_flat_list_of_its_rows(read) -> None:
         np.testing.assert_array_equal(one.sfm_from_camera, other.sfm_from_camera)
 
 
+def test_a_matrix_may_be_homogeneous(read) -> None:
+    doubled = read([frame(i, transform_matrix=(2 * matrix(i)).tolist()) for i in range(3)], **LENS)
+    plain = read([frame(i) for i in range(3)], **LENS)
+    assert doubled.notes == []
+    for one, other in zip(doubled.model.images, plain.model.images, strict=True):
+        np.testing.assert_allclose(one.sfm_from_camera, other.sfm_from_camera, atol=1e-15)
+
+
 def test_frames_without_photo_and_photos_without_frame_are_named(read) -> None:
     known = read([frame(0), frame(1), frame(7)], **LENS)
     assert codes(known.notes) == ["sfm.no-photo", "sfm.no-camera"] and "ä2.png" in known.notes[1].text
@@ -343,12 +404,15 @@ def test_no_frame_with_a_photo_is_an_error(read) -> None:
 
 def test_a_photo_has_one_frame(read) -> None:
     for second in (frame(1, fl_x=51.0), frame(1, transform_matrix=matrix(2).tolist())):
-        with refused("sfm.two-frames", "ä1.png", "./1"):
+        differs = "fl_x" if "fl_x" in second else "transform_matrix"
+        with refused("sfm.two-frames", "transforms.json", "ä1.png", "./1", f"differ in {differs}"):
             read([frame(1), second], **LENS)
 
 
-def test_frames_that_are_listed_twice_alike_count_once(read) -> None:
-    known = read([frame(0), frame(1), frame(1), frame(2)], **LENS)
+@pytest.mark.parametrize("rounding", [0.0, 1e-12])
+def test_frames_that_are_listed_twice_alike_count_once(read, rounding: float) -> None:
+    again = frame(1, transform_matrix=(matrix(1) + np.pad([[rounding]], (0, 3))).tolist())
+    known = read([frame(0), frame(1), again, frame(2)], **LENS)
     assert [image.file for image in known.model.images] == ["a0.png", "a1.png", "a2.png"]
     assert codes(known.notes) == ["sfm.repeated-frames"]
 
@@ -484,6 +548,8 @@ def test_a_name_that_two_photos_share_matches_neither(tmp_path: Path) -> None:
         (["b/0.jpg", "1.jpg"], ["0.png", "b/1.png"], {}),  # of another folder as well
         (["0.jpg", "1.jpg", "1.jpeg"], ["0.png", "0.tif", "1.png"], {}),
         (["0.jpg", "0.png"], ["0.png"], {1: "0.png"}),
+        (["IMG_0.JPG", "B/1.PNG"], ["img_0.jpg", "b/1.png"], {0: "img_0.jpg", 1: "b/1.png"}),
+        (["IMG_0.JPG"], ["img_0.jpg", "Img_0.jpg"], {}),
         (["a\u0308.png", "b/o\u0308.jpg"], ["\u00e4.png", "\u00f6.jpg"], {0: "\u00e4.png", 1: "\u00f6.jpg"}),
         (["c/a\u0308.jpg", "c/a\u0308.png"], ["c/\u00e4.jpg", "c/\u00e4.png"], {0: "c/\u00e4.jpg", 1: "c/\u00e4.png"}),
     ],
@@ -500,7 +566,7 @@ def test_cameras_of_photos_with_another_ending_are_taken_and_named(tmp_path: Pat
     colmap_model(tmp_path, ["ä0.jpg", "a1.png", "ä2.png"])
     known = read_poses(tmp_path, PHOTOS, {})
     assert [image.file for image in known.model.images] == ["a0.png", "a1.png", "a2.png"]
-    assert codes(known.notes) == ["sfm.other-endings"] and "ä0.png (ä0.jpg)" in known.notes[0].text
+    assert codes(known.notes) == ["sfm.other-spellings"] and "ä0.png (ä0.jpg)" in known.notes[0].text
 
 
 def test_one_name_that_is_not_clear_leaves_the_other_cameras(tmp_path: Path) -> None:
