@@ -55,4 +55,4 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """Match pairs of photos, write what they agree on, fuse it into points."""
     from stages.depth.estimation import estimate_depth
 
-    return estimate_depth(plan(config, inputs, progress), inputs, folder, progress)
+    return estimate_depth(config, inputs, folder, progress)

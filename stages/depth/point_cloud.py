@@ -142,7 +142,7 @@ def normals(viewpoint: Viewpoint, depth: DepthMap) -> Float[np.ndarray, "h w 3"]
     # The moments' inverse is their adjugate over their determinant, which is positive: only its direction is wanted.
     adjugate = [np.cross(moments[(i + 1) % 3], moments[(i + 2) % 3], axis=0) for i in range(3)]
     determinant = (moments[0] * adjugate[0]).sum(axis=0)
-    plane = sum(part * one for part, one in zip(adjugate, sums, strict=True))
+    plane = adjugate[0] * sums[0] + adjugate[1] * sums[1] + adjugate[2] * sums[2]
     length = np.linalg.norm(plane, axis=0)
     solid = (determinant > OPEN * np.trace(moments) ** 3) & (length > 0)
     result = -rays

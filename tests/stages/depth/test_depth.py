@@ -12,7 +12,7 @@ import pytest
 
 from nerf.runtime import parallel
 from stages import depth
-from stages.contract import Inputs, Photos, StageResult, Workload
+from stages.contract import Inputs, Photos, StageResult, Workload, plan_stage
 from stages.depth import Config, estimation, files
 from stages.depth.files import depth_map_file, read_depth_map
 from tests.conftest import SilentProgress
@@ -177,11 +177,11 @@ def test_imported_cameras_without_points_do(tmp_path) -> None:
 def test_a_short_time_makes_smaller_maps(inputs, tmp_path) -> None:
     sides = []
     for seconds in (1e-3, 1e3):
-        planned = depth.plan(Config(seconds=seconds), inputs, SilentProgress())
+        planned = plan_stage(depth, Config(seconds=seconds), inputs, SilentProgress())
         assert planned.downscale is not None
         sides.append(240 / planned.downscale)
     assert sides == [pytest.approx(160, rel=0.01), 240]
-    assert depth.plan(Config(), inputs, SilentProgress()).downscale == 1
+    assert plan_stage(depth, Config(), inputs, SilentProgress()).downscale == 1
 
 
 def test_more_photos_and_neighbours_are_expected_to_take_longer() -> None:
