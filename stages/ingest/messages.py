@@ -58,6 +58,10 @@ def note_unused(source: Source, photos: Path, progress: Progress) -> None:
         lie, them = ("1 photo lies", "is") if beside == 1 else (f"{beside} photos lie", "are")
         how = f"to use all, move them into images/; to use only them, move images/ out of {folder}"
         progress.note("ingest.photos-beside-images", f"{lie} in {folder} beside images/ and {them} not used: {how}")
+    if others := source.other_endings:
+        which = listed([f"{shown(photo)} ({shown(path)})" for path, photo in others.items()], 3)
+        words = f"{len(others)} frames name files of another ending than the photos that are taken for them: {which}"
+        progress.note("ingest.other-endings", words)
     if (cameras := unused_cameras(source)) is not None:
         place, option = shown(str(cameras)), shown(f"--cameras {shlex.quote(str(cameras))}")
         progress.note("ingest.unused-cameras", f"cameras lie in {place} and are not used: {option} would use them")

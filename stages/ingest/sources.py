@@ -5,9 +5,10 @@ Cheap: lists folders and reads at most the JSON of a transforms file, never an i
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
@@ -20,7 +21,24 @@ from stages.io.transforms_files import HELD_OUT, TRAIN, photo_names, read_splits
 SourceKind = Literal["photos", "video", "transforms", "blender", "colmap", "llff"]
 
 FEW_NAMES = 2
+MAX_DEPTH = 4  # folders below one that is given, in which COLMAP models are looked for: colmap/sparse/0, dense/0/sparse
 LLFF, LLFF_FILE = ".npy", "poses_bounds.npy"  # the ending of LLFF's file of cameras, and what it is called
+_CONVERTER = "Export a COLMAP model, or make a transforms.json of it: ns-process-data {} --help (nerfstudio)"
+# Files of cameras that are not read, by their endings: what they are, and what to do.
+OTHER_CAMERAS = {
+    ".xml": ("an XML file, as Metashape writes it", _CONVERTER.format("metashape")),
+    ".csv": ("a table, as RealityScan writes it", _CONVERTER.format("realitycapture")),
+    ".xmp": ("one photo's XMP file, as RealityScan writes it", _CONVERTER.format("realitycapture")),
+    ".db": (
+        "COLMAP's database, which holds features and matches, and no poses",
+        "Give the folder of the model that was made of it (sparse/0), or leave --cameras out.",
+    ),
+    ".out": ("a Bundler file", ""),
+    ".nvm": ("a VisualSFM file", ""),
+    ".sfm": ("a Meshroom file", ""),
+    ".abc": ("an Alembic file", ""),
+    ".npz": ("a NumPy archive", ""),
+}
 _HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
 
 
@@ -36,7 +54,7 @@ class Source:
     the files that a transforms file names as masks, each after its photo's name and .png, and then all files in folders
     named masks, each after the name, relative to ``root``, that it would have without such a folder in it. ``excluded``
     are files in a folder of photos that belong to one of them by their names, as a depth map does, and that photo, by
-    name.
+    name. ``other_endings`` are those of ``frames`` whose photo has another ending than its file_path.
     """
 
     kind: SourceKind
@@ -46,6 +64,7 @@ class Source:
     frames: Mapping[str, str] = field(default_factory=dict)
     masks: tuple[tuple[str, Path], ...] = ()
     excluded: Mapping[str, str] = field(default_factory=dict)
+    other_endings: Mapping[str, str] = field(default_factory=dict)
 
     def name(self, file: Path) -> str:
         """The name of one of ``files``: relative to ``root``, with forward slashes, always encodable as UTF-8."""
@@ -81,7 +100,7 @@ def _source(photos: Path, cameras: Path | None) -> Source:
     if photos.is_file() and is_video(photos):
         return Source("video", photos.parent, None, (photos,))
     if photos.is_file():
-        return _from_transforms("transforms", photos.parent, photos)
+        return _from_transforms("transforms", photos.parent, photos, alone=True)
     root = photo_root(photos)
     cameras = cameras and _llff_in(cameras)
     if cameras is not None and cameras.is_file() and cameras.suffix.lower() != LLFF:
@@ -111,9 +130,9 @@ def unused_cameras(source: Source) -> Path | None:
     if source.kind != "photos":
         return None
     places = (source.root.parent, source.root) if source.root.name == "images" else (source.root,)
-    for place in places:
+    for place, name in product(places, ("sparse", "colmap", "dense")):
         with suppress(StageError, OSError):
-            return _colmap_model(place / "sparse", [source.name(file) for file in source.files])
+            return _colmap_model(place / name, [source.name(file) for file in source.files])
     for file in (place / "transforms.json" for place in places):
         with suppress(StageError, OSError):
             if set(_from_transforms("transforms", source.root, file).files) & set(source.files):
@@ -219,19 +238,27 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
             f"{photos.name} and --cameras {cameras}",
             "Give the photo folder with --cameras.",
         )
-    if cameras is not None and cameras.is_file() and (suffix := cameras.suffix.lower()) not in (".json", LLFF):
-        of_colmap = suffix in (".bin", ".txt")
-        raise StageError("ingest.unknown-cameras", 
-            f"cannot use the cameras {cameras.name}",
-            "it is no transforms file, whose name ends in .json, and no poses_bounds.npy",
-            f"Give the folder of the COLMAP model: --cameras {cameras.parent}" if of_colmap else
-            "Give a transforms file or the folder of a COLMAP model: cameras in other forms are not read.",
-        )  # fmt: skip
+    if cameras is not None and cameras.is_file() and cameras.suffix.lower() not in (".json", LLFF):
+        raise _unknown_cameras(cameras)
 
 
-def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
+def _unknown_cameras(cameras: Path) -> StageError:
+    suffix = cameras.suffix.lower()
+    what, hint = OTHER_CAMERAS.get(suffix, ("of another kind", ""))
+    if suffix in (".bin", ".txt"):
+        what, hint = "one file of a COLMAP model", f"Give its folder: --cameras {cameras.parent}"
+    return StageError(
+        "ingest.unknown-cameras",
+        f"cannot use the cameras {cameras.name}",
+        f"it is {what}; a transforms file (.json), the folder of a COLMAP model and poses_bounds.npy are read",
+        hint or "Export one of these, or leave --cameras out, and the cameras are found from the photos.",
+    )
+
+
+def _from_transforms(kind: SourceKind, root: Path, cameras: Path, alone: bool = False) -> Source:
+    """``alone``: the file was given as PHOTOS, and so its folder is a stranger's."""
     place = cameras.parent if cameras.is_file() else cameras
-    find = FrameFiles((root,) if place == root else (root, root.parent, place))
+    find = FrameFiles((root,) if place == root else (root, root.parent, place), follows_links=not alone)
     frames, files = _frames(cameras, find)
     if not any(map(Path.is_file, files.values())):
         find = replace(find, of_other_folders=True)
@@ -244,7 +271,8 @@ def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
     foreign = [frame for frame in frames if len(photo_names(frame)) == 1]
     named = {photos[frame["file_path"]]: mask for frame in foreign if (mask := frame.get("mask_path"))}
     masks = tuple((f"{photo}.png", find.mask(mask)) for photo, mask in named.items())
-    return Source(kind, root, cameras, in_order, photos, masks)
+    other_endings = {path: _name(root, file) for path, file in find.other_endings.items()}
+    return Source(kind, root, cameras, in_order, photos, masks, other_endings=other_endings)
 
 
 def _frames(cameras: Path, find: FrameFiles) -> tuple[list[dict[str, Any]], dict[str, Path]]:
@@ -316,10 +344,18 @@ def _llff_in(cameras: Path) -> Path:
 
 
 def _colmap_models(folder: Path) -> list[Path]:
-    """All COLMAP models in ``folder``: itself, and below it and its ``sparse`` folder."""
+    """All COLMAP models in ``folder``: itself, and below it and its ``sparse`` folder; where there is none, deeper."""
     places = [folder, folder / "sparse"]
     places += [child for place in places if place.is_dir() for child in sorted(place.iterdir())]
-    return sorted({place for place in places if _model_files(place)})
+    found = sorted({place for place in places if _model_files(place)})
+    return found or sorted(place for place in _below(folder, MAX_DEPTH) if _model_files(place))
+
+
+def _below(folder: Path, depth: int) -> Iterator[Path]:
+    for child in folder.iterdir() if depth and folder.is_dir() else ():
+        if child.is_dir() and not child.name.startswith(".") and not (child / "run.json").is_file():
+            yield child
+            yield from _below(child, depth - 1)
 
 
 def _colmap_model(folder: Path, photos: Sequence[str]) -> Path:
@@ -330,8 +366,9 @@ def _colmap_model(folder: Path, photos: Sequence[str]) -> Path:
         raise StageError(
             "ingest.no-colmap-model",
             f"no COLMAP model in {folder}",
-            "there is no cameras and images with .bin or .txt, nor a transforms.json",
-            "Give the model's own folder, for example sparse/0, or a transforms file.",
+            _what_is_missing(folder),
+            "Give the folder of a COLMAP model (sparse/0), a transforms.json or a poses_bounds.npy; or leave --cameras "
+            "out, and the cameras are found from the photos.",
         )
     if len(models) > 1:
         counts = {model: _cameras_of(model, photos) for model in models}
@@ -344,6 +381,17 @@ def _colmap_model(folder: Path, photos: Sequence[str]) -> Path:
             f"Give the one with most: --cameras {best}",
         )
     return models[0]
+
+
+def _what_is_missing(folder: Path) -> str:
+    parts = [path.name for part in ("cameras", "images") for path in folder.glob(f"{part}.*")]
+    here = [path for path in folder.iterdir() if path.is_file()] if folder.is_dir() else []
+    if parts:
+        return f"it needs cameras and images, both in .bin or in .txt, and there is only {listed(parts, FEW_NAMES)}"
+    if database := next((path.name for path in here if path.suffix.lower() == ".db"), None):
+        return f"{database} holds COLMAP's features and matches, and no poses"
+    there = f"; there is {listed(sorted(path.name for path in here), FEW_NAMES)}" if here else ""
+    return f"there is no cameras and images with .bin or .txt, nor a transforms.json{there}"
 
 
 def _cameras_of(model: Path, photos: Sequence[str]) -> int:

@@ -11,7 +11,7 @@ import pytest
 
 from stages.contract import StageError
 from stages.ingest.auxiliary_files import pair_masks
-from stages.ingest.sources import Source, camera_files, find_source, is_gone, photos_beside
+from stages.ingest.sources import Source, camera_files, find_source, is_gone, photos_beside, unused_cameras
 from tests.refusals import refused
 
 
@@ -201,9 +201,9 @@ def test_frames_may_not_leave_their_folder(tmp_path: Path, file_path: str) -> No
     (tmp_path / "scene/link").symlink_to(tmp_path)
     error = refusal(transforms(tmp_path / "scene/transforms.json", "images/a.jpg", file_path))
     assert error.what == f"rejected the photo {file_path!r}"
-    of_link = "Give the photo folder apart, if it is a link: pipeline run PHOTOS --cameras FILE."
-    of_name = "A transforms file may name photos inside its own folder only."
-    assert error.hint == (of_link if file_path.startswith("link") else of_name)
+    assert error.hint == "Give the folder of the photos apart: pipeline run PHOTOS --cameras FILE"
+    apart = refusal(tmp_path / "scene", tmp_path / "scene/transforms.json")
+    assert apart.what == error.what and f"inside {tmp_path}/scene/images only" in apart.hint
 
 
 @pytest.mark.parametrize(
@@ -263,9 +263,34 @@ def test_words_for_cameras_that_cannot_be_used(tmp_path: Path) -> None:
     assert refusal(cameras, cameras).what == "two sources of cameras"
     touch(tmp_path, "images.bin", "cameras.txt", "cams.csv")
     for name in ("images.bin", "cameras.txt"):
-        hint = f"Give the folder of the COLMAP model: --cameras {tmp_path}"
-        assert refusal(tmp_path / "photos", tmp_path / name).hint == hint
-    assert refusal(tmp_path / "photos", tmp_path / "cams.csv").hint.endswith("cameras in other forms are not read.")
+        assert refusal(tmp_path / "photos", tmp_path / name).hint == f"Give its folder: --cameras {tmp_path}"
+    for name, what, hint in (
+        ("cams.csv", "as RealityScan writes it", "ns-process-data realitycapture"),
+        ("cams.xml", "as Metashape writes it", "ns-process-data metashape"),
+        ("database.db", "no poses", "sparse/0"),
+        ("bundle.out", "a Bundler file", "leave --cameras out"),
+        ("cams.xyz", "of another kind", "leave --cameras out"),
+    ):
+        error = refusal(tmp_path / "photos", touch(tmp_path, name) / name)
+        assert name in error.what and what in error.why and hint in error.hint
+
+
+def test_what_is_missing_of_a_colmap_model_is_named(tmp_path: Path) -> None:
+    touch(tmp_path, "photos/a.jpg", "db/database.db", "half/sparse/0/cameras.txt", "half/sparse/0/rigs.txt", "m/a.ply")
+    assert "database.db holds COLMAP's features" in refusal(tmp_path / "photos", tmp_path / "db").why
+    assert "there is only cameras.txt" in refusal(tmp_path / "photos", tmp_path / "half/sparse/0").why
+    assert refusal(tmp_path / "photos", tmp_path / "m").why.endswith("there is a.ply")
+
+
+@pytest.mark.parametrize("place", ["colmap/sparse/0", "dense/0/sparse", "a/b/c/d"])
+def test_a_colmap_model_may_lie_deeper(tmp_path: Path, place: str) -> None:
+    touch(tmp_path, "images/a.jpg", *(f"{place}/{name}" for name in COLMAP), "old.nerf/run.json", ".git/x")
+    touch(tmp_path, *(f"{hidden}/sfm/{name}" for hidden in ("old.nerf", ".git") for name in COLMAP))
+    assert find_source(tmp_path / "images", tmp_path).cameras == tmp_path / place
+    unused = unused_cameras(find_source(tmp_path))
+    assert unused == (tmp_path / place if place[0] != "a" else None)
+    touch(tmp_path, *(f"sparse/0/{name}" for name in COLMAP))
+    assert find_source(tmp_path / "images", tmp_path).cameras == tmp_path / "sparse/0"
 
 
 @pytest.mark.parametrize(("name", "kind"), [("transforms.json", "transforms"), ("transforms_train.json", "blender")])
