@@ -6,16 +6,25 @@ Cheap: lists folders and reads at most the JSON of a transforms file, never an i
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from stages.contract import StageError, listed
-from stages.ingest.auxiliary_files import IGNORED, auxiliary_files, instant_ngp_masks, pair_masks
+from stages.ingest.auxiliary_files import IGNORED, auxiliary_files, instant_ngp_masks, is_mask, pair_masks
 from stages.ingest.frame_files import FrameFiles
-from stages.ingest.listing import FOLDER_HINT, IMAGES, files_below, is_video, list_photos, photo_root, walk_photos
+from stages.ingest.listing import (
+    FOLDER_HINT,
+    IMAGES,
+    MASKS,
+    files_below,
+    is_video,
+    list_photos,
+    photo_root,
+    walk_photos,
+)
 from stages.io.transforms_files import HELD_OUT, TRAIN, photo_names, read_splits
 
 SourceKind = Literal["photos", "video", "transforms", "blender", "colmap", "llff"]
@@ -39,6 +48,7 @@ OTHER_CAMERAS = {
     ".abc": ("an Alembic file", ""),
     ".npz": ("a NumPy archive", ""),
 }
+_OF_MASKS = re.compile(r"masks?([._-].*)?", re.IGNORECASE)
 _HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
 
 
@@ -146,9 +156,9 @@ def unused_masks(source: Source) -> Path | None:
     if source.masks:
         return None
     names = [source.name(file) for file in source.files]
-    folders = [source.root.parent / name for name in ("masks", "mask")]
-    folders += [source.cameras.parent / "masks"] if source.cameras else []
-    for folder in filter(Path.is_dir, folders):
+    folders = [source.root.parent, *([source.cameras.parent] if source.cameras else [])]
+    named = [child for folder in folders for child in sorted(folder.iterdir()) if _OF_MASKS.fullmatch(child.name)]
+    for folder in filter(Path.is_dir, named):
         inside = files_below(folder, lambda _: True)
         if pair_masks(names, [(_name(folder, file), file) for file in inside])[0]:
             return folder
@@ -160,7 +170,7 @@ def photos_beside(source: Source, photos: Path) -> int:
     if source.kind not in ("photos", "colmap") or source.root != photos.absolute() / "images":
         return 0
     named = (file for file in photos.glob("*") if file.suffix.lower() in IMAGES and not file.name.startswith("."))
-    return sum(file.is_file() for file in named)
+    return sum(file.is_file() and not is_mask(file.name) for file in named)
 
 
 def is_gone(photos: Path) -> bool:
@@ -176,16 +186,22 @@ def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], 
     """What lies in a ``masks`` folder in ``root`` or in any folder of photos below it, or beside one of these that is
     called as folders of nothing but photos are. See :class:`Source`."""
     holders = sorted({holder for file in files for holder in file.parents if holder.is_relative_to(root)} | {root})
-    places = [(holder / "masks", holder.relative_to(root)) for holder in holders]
-    places += [
-        (holder.parent / "masks", holder.relative_to(root)) for holder in holders if _HAS_BESIDE.fullmatch(holder.name)
-    ]
+    places = [(masks, holder.relative_to(root)) for holder in holders for masks in _named_masks(holder)]
+    for holder in holders:
+        if named := _HAS_BESIDE.fullmatch(holder.name):
+            of_reduced = _named_masks(holder.parent, named[1] or "")
+            places += [(masks, holder.relative_to(root)) for masks in of_reduced or _named_masks(holder.parent)]
     found = []
     for masks, stands_in in places:
-        if masks.is_dir():
-            inside = files_below(masks, lambda folder: not folder.name.startswith("."))
-            found += [(_name(masks, file, stands_in), file) for file in inside]
+        inside = files_below(masks, lambda folder: not folder.name.startswith("."))
+        found += [(_name(masks, file, stands_in), file) for file in inside]
     return tuple(found)
+
+
+def _named_masks(holder: Path, reduced: str = "") -> list[Path]:
+    """The folders of masks in a folder: Masks is one, too; of ``images_4`` those are in ``masks_4``."""
+    with os.scandir(holder) if holder.is_dir() else nullcontext(()) as entries:
+        return sorted(Path(one) for one in entries if one.name.lower() == MASKS + reduced and one.is_dir())
 
 
 def _beside(source: Source) -> tuple[tuple[str, Path], ...]:

@@ -11,7 +11,15 @@ import pytest
 
 from stages.contract import StageError
 from stages.ingest.auxiliary_files import pair_masks
-from stages.ingest.sources import Source, camera_files, find_source, is_gone, photos_beside, unused_cameras
+from stages.ingest.sources import (
+    Source,
+    camera_files,
+    find_source,
+    is_gone,
+    photos_beside,
+    unused_cameras,
+    unused_masks,
+)
 from tests.refusals import refused
 
 
@@ -227,6 +235,17 @@ def test_a_transforms_file_that_is_none(tmp_path: Path, content: str, why: str) 
     assert refusal(tmp_path / "transforms.json").why.startswith(why)
 
 
+def test_a_transforms_file_without_its_photos(tmp_path: Path) -> None:
+    touch(tmp_path, "photos/DSC_1.jpg", "photos/DSC_2.jpg")
+    cameras = transforms(tmp_path / "transforms.json", "images/frame_1.jpg", "images/frame_2.jpg")
+    error = refusal(tmp_path / "photos", cameras)
+    assert (error.code, error.what) == (
+        "ingest.cameras-of-other-photos",
+        "none of the 2 photos of transforms.json is there",
+    )
+    assert "images/frame_1.jpg" in error.why and f"{tmp_path}/photos has DSC_1.jpg" in error.why
+
+
 def test_words_for_what_cannot_be_used(tmp_path: Path) -> None:
     touch(
         tmp_path,
@@ -320,6 +339,29 @@ def test_a_video_or_a_folder_with_nothing_else(tmp_path: Path, given: str) -> No
         "decided by ingest: no poses can be imported for them. "
         "Leave --cameras out, or give the folder of the photos that the cameras belong to."
     )
+
+
+@pytest.mark.parametrize(
+    ("photos", "masks"),
+    [
+        ("images", "Masks"),
+        ("images_4", "masks_4"),
+        ("images_4", "masks"),
+        ("images_4", "MASKS_4"),
+        ("images", "images/Masks"),
+    ],
+)
+def test_folders_of_masks_by_other_names(tmp_path: Path, photos: str, masks: str) -> None:
+    touch(tmp_path, f"{photos}/a.jpg", f"{masks}/a.png")
+    assert find_source(tmp_path / photos).masks == (("a.png", tmp_path / masks / "a.png"),)
+
+
+def test_masks_of_reduced_photos_go_before_others(tmp_path: Path) -> None:
+    touch(tmp_path, "images_4/a.jpg", "masks/a.png", "masks_4/a.png", "masks_8/a.png")
+    source = find_source(tmp_path / "images_4")
+    assert source.masks == (("a.png", tmp_path / "masks_4/a.png"),)
+    other = find_source(touch(tmp_path, "other/images/a.jpg", "other/mask_2/a.png") / "other")
+    assert other.masks == () and unused_masks(other) == tmp_path / "other/mask_2"
 
 
 def test_masks_are_listed_by_their_names_without_folder(tmp_path: Path) -> None:
