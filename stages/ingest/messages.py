@@ -10,7 +10,7 @@ from stages.ingest.auxiliary_files import ALL_PHOTOS, instant_ngp_masks, is_mask
 from stages.ingest.masks import STILL_BACKGROUND_HINT
 from stages.ingest.near_duplicates import Brackets
 from stages.ingest.sharpness import BLURRED
-from stages.ingest.sources import Source, photos_beside, unused_cameras, unused_masks
+from stages.ingest.sources import Source, mask_beside, photos_beside, unused_cameras, unused_masks
 from stages.io.photos import Photo, Rejection
 
 MAX_NOTES = 10
@@ -67,6 +67,8 @@ def note_unused(source: Source, photos: Path, progress: Progress) -> None:
     if (cameras := unused_cameras(source)) is not None:
         place, option = shown(str(cameras)), shown(f"--cameras {shlex.quote(str(cameras))}")
         progress.note("ingest.unused-cameras", f"cameras lie in {place} and are not used: {option} would use them")
+    if (mask := mask_beside(source, photos)) is not None:
+        progress.note(*_one_mask(str(mask)))
     if (masks := unused_masks(source)) is not None:
         lie, wanted = shown(str(masks)), shown(str(source.root / "masks"))
         progress.note(
@@ -89,8 +91,7 @@ def excluded(files: Mapping[str, str]) -> list[Note]:
     words = f"{count} excluded, named as a mask, depth map or other copy of a photo: {listed(named, 3)}"
     notes.append(Note("ingest.excluded", words))
     if mask := next((name for name, photo in sorted(files.items()) if photo == ALL_PHOTOS), None):
-        words = f"to be used as a mask of all photos, {shown(mask)} would have to be copied to masks/NAME.png for each"
-        notes.append(Note("ingest.one-mask", words))
+        notes.append(_one_mask(mask))
     elif mask := next((name for name in sorted(files) if is_mask(name)), None):
         place = f"masks/{os.path.splitext(files[mask])[0]}.png"
         notes.append(
@@ -100,6 +101,11 @@ def excluded(files: Mapping[str, str]) -> list[Note]:
             )
         )
     return notes
+
+
+def _one_mask(name: str) -> Note:
+    words = f"{shown(name)} is not used: as a mask of all photos it would have to be copied to masks/NAME.png for each"
+    return Note("ingest.one-mask", words)
 
 
 def excluded_by_values(files: Sequence[str]) -> list[Note]:

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from stages.contract import StageError, listed
-from stages.ingest.auxiliary_files import IGNORED, auxiliary_files, instant_ngp_masks, is_mask, pair_masks
+from stages.ingest.auxiliary_files import IGNORED, ONE_FOR_ALL, auxiliary_files, instant_ngp_masks, is_mask, pair_masks
 from stages.ingest.frame_files import FrameFiles
 from stages.ingest.listing import (
     FOLDER_HINT,
@@ -171,6 +171,14 @@ def photos_beside(source: Source, photos: Path) -> int:
         return 0
     named = (file for file in photos.glob("*") if file.suffix.lower() in IMAGES and not file.name.startswith("."))
     return sum(file.is_file() and not is_mask(file.name) for file in named)
+
+
+def mask_beside(source: Source, photos: Path) -> Path | None:
+    """A single mask in the folder PHOTOS itself where the photos of its ``images`` folder are taken."""
+    if source.root != photos.absolute() / "images":
+        return None
+    named = (file for file in sorted(photos.iterdir()) if file.suffix.lower() in IMAGES)
+    return next((file for file in named if file.stem.lower() in ONE_FOR_ALL), None)
 
 
 def is_gone(photos: Path) -> bool:

@@ -76,7 +76,7 @@ def test_a_linked_photo_folder_may_lack_its_cameras(tmp_path: Path) -> None:
         assert names(find_source(tmp_path / photos, cameras)) == ["a.jpg"]
 
 
-def test_links_to_photos_are_followed_in_a_folder_that_is_given(tmp_path: Path) -> None:
+def test_links_to_photos_are_followed_in_given_folders(tmp_path: Path) -> None:
     """As they are without cameras; a transforms file alone opens nothing outside of its folder."""
     touch(tmp_path, "store/a.jpg", "store/deep/b.jpg", "set/images/c.jpg")
     (tmp_path / "set/images/a.jpg").symlink_to(tmp_path / "store/a.jpg")

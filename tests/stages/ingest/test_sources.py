@@ -356,6 +356,13 @@ def test_folders_of_masks_by_other_names(tmp_path: Path, photos: str, masks: str
     assert find_source(tmp_path / photos).masks == (("a.png", tmp_path / masks / "a.png"),)
 
 
+def test_one_mask_beside_photos_is_found(tmp_path: Path) -> None:
+    touch(tmp_path, "images/a.jpg", "images/b.jpg", "Mask.png", "c.jpg")
+    source = find_source(tmp_path)
+    assert mask_beside(source, tmp_path) == tmp_path / "Mask.png" and photos_beside(source, tmp_path) == 1
+    assert mask_beside(find_source(tmp_path / "images"), tmp_path / "images") is None
+
+
 def test_masks_of_reduced_photos_go_before_others(tmp_path: Path) -> None:
     touch(tmp_path, "images_4/a.jpg", "masks/a.png", "masks_4/a.png", "masks_8/a.png")
     source = find_source(tmp_path / "images_4")
