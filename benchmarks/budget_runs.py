@@ -28,6 +28,7 @@ from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.schedule import new_schedule
 from nerf.training.trainer import FieldTrainer
+from pipeline.cli.terminal import PlainDisplay
 from stages.effects.decisions import Decisions, read_decisions
 from stages.effects.image_effects import held_out_images, image_effects
 from stages.hardware.backend import chosen_backend, load_backend
@@ -52,15 +53,6 @@ SCHEDULES = ("whole", "more")
 """more: half of the steps as a run of their own, then the other half on top (`--more`)."""
 
 
-class Quiet:
-    """Says nothing."""
-
-    def update(self, message: str, done: float | None = None) -> None: ...
-
-    def note(self, code: str, text: str) -> None:
-        print(text)
-
-
 class Bench(NamedTuple):
     """What all runs of one set share."""
 
@@ -81,15 +73,15 @@ def bench_of(workspace: Path) -> Bench:
         Config(
             space=chosen_space(decisions, scene)[0],
             view_dependence="view_dependence" in decisions.on,
-            grid=HashGridOptions(backend=chosen_backend(compute_device(), Quiet()), micro_batches=MICRO_BATCHES),
+            grid=HashGridOptions(backend=chosen_backend(compute_device(), PlainDisplay()), micro_batches=MICRO_BATCHES),
         )
     )
     rays = ONCE * field_of(config).rays_per_step(config)
     downscale = chosen_downscale(scene, rays)
     config = config.model_copy(update={"downscale": downscale})
     config = field_of(config).with_sizes(config, scene, rays)
-    train = guided_dataset(inputs, scene, downscale, Quiet())
-    test = training_dataset(inputs["ingest"], scene, "test", downscale, Quiet())
+    train = guided_dataset(inputs, scene, downscale, PlainDisplay())
+    test = training_dataset(inputs["ingest"], scene, "test", downscale, PlainDisplay())
     shown_over = torch.tensor(field_background(config, scene))
     pixels = sample_evaluation_pixels(test, EVALUATION_PIXELS, shown_over, seed=0)
     return Bench(
@@ -159,7 +151,7 @@ def main() -> None:
             if any(run.items() <= made.items() for made in runs):
                 continue
             bench = bench or bench_of(workspace)
-            load_backend(bench.config.grid.backend or "warp", compute_device(), Quiet())
+            load_backend(bench.config.grid.backend or "warp", compute_device(), PlainDisplay())
             clock = time.process_time()
             run |= train_run(bench, seed, steps, given.schedule)
             last = run["points"][-1]

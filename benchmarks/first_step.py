@@ -19,9 +19,9 @@ import time
 from pathlib import Path
 
 from benchmarks.nerfacto import HERE, pipeline
-from benchmarks.pixel_store import Spoken
 from benchmarks.record import Record, add_out
 from nerf.geometry.scene import Camera
+from pipeline.cli.terminal import PlainDisplay
 from pipeline.demo import demo_truth, write_photos
 from stages.io.files import write_json
 from stages.io.transforms_export import intrinsics, opengl_matrix
@@ -55,7 +55,7 @@ main()
 def made(folder: Path) -> Path:
     """A workspace of a small scene, finished up to stage effects."""
     truth, photos = demo_truth(LENS, PHOTOS, seed=0), folder / "photos"
-    write_photos(photos, truth, Spoken())
+    write_photos(photos, truth, PlainDisplay())
     frames = [{"file_path": name, "transform_matrix": opengl_matrix(pose)} for name, pose in truth.poses.items()]
     write_json(photos / "transforms.json", intrinsics(LENS) | {"frames": frames})
     workspace, cameras = folder / "made.nerf", photos / "transforms.json"

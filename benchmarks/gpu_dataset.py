@@ -9,7 +9,7 @@ from pathlib import Path
 
 from safetensors.torch import save_file
 
-from benchmarks.pixel_store import Spoken
+from pipeline.cli.terminal import PlainDisplay
 from stages.io.files import read_scene
 from stages.train.data import guided_dataset, training_dataset
 
@@ -24,8 +24,8 @@ def main() -> None:
     folders = {name: (given.workspace / "output" / shown).resolve().parent for name, shown in SHOWN.items()}
     scene = read_scene(folders["normalise"])
     datasets = {
-        "train": guided_dataset(folders, scene, 1.0, Spoken()),
-        "test": training_dataset(folders["ingest"], scene, "test", 1.0, Spoken()),
+        "train": guided_dataset(folders, scene, 1.0, PlainDisplay()),
+        "test": training_dataset(folders["ingest"], scene, "test", 1.0, PlainDisplay()),
     }
     tables = {
         f"{split}.{name}": table.contiguous()

@@ -15,18 +15,20 @@ from typing import Any
 import torch
 
 from benchmarks.nerfacto import pipeline, stage_folder
-from benchmarks.pixel_store import Spoken
 from benchmarks.record import Record, add_out
 from nerf.geometry.scene import Scene
 from nerf.runtime.machine_rates import measure_rates
 from nerf.runtime.matmul_precision import use_matmul_precision
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import FieldTrainer
+from pipeline.cli.terminal import PlainDisplay
+from stages import train
+from stages.contract import plan_stage
 from stages.effects.decisions import Decisions, read_decisions
 from stages.effects.image_effects import image_effects
 from stages.hardware.device import compute_device, cores
 from stages.io.files import read_scene
-from stages.train import Config, plan
+from stages.train import Config
 from stages.train.data import guided_dataset
 from stages.train.fields.field_list import field_of, make_trainer
 from stages.train.profile import FIRST_PROFILED_STEP, RATES_SECONDS, profile_table, profiled_step
@@ -84,7 +86,7 @@ def prepared(workspace: Path, asked: Config) -> tuple[Config, FieldTrainer]:
 def loaded(workspace: Path, asked: Config) -> tuple[Config, Scene, RayDataset, Decisions]:
     """What a fresh field is made of: the settings that stage train chose, which are printed, and its inputs."""
     inputs = {stage: stage_folder(workspace, output) for stage, output in LINKED.items()}
-    scene, config = read_scene(inputs["normalise"]), plan(asked, inputs, Spoken())
+    scene, config = read_scene(inputs["normalise"]), plan_stage(train, asked, inputs, PlainDisplay())
     assert config.downscale, "plan() chooses it"
     grid = config.grid
     sizes = f"{grid.num_levels} grids of 2^{grid.log2_hashmap_size} rows to {grid.max_res}³"
@@ -93,7 +95,7 @@ def loaded(workspace: Path, asked: Config) -> tuple[Config, Scene, RayDataset, D
         f"{grid.target_samples:,} colours in a step of {grid.micro_batches} micro-batches, {cores()} cores at work"
     )
     print(f"{sizes}, {of_step}", flush=True)
-    dataset = guided_dataset(inputs, scene, config.downscale, Spoken()).to(compute_device())
+    dataset = guided_dataset(inputs, scene, config.downscale, PlainDisplay()).to(compute_device())
     return config, scene, dataset, read_decisions(inputs["effects"])
 
 

@@ -32,6 +32,7 @@ from benchmarks.record import Record, add_out
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from nerf.training.pixel_sampler import PixelSampler
 from nerf.training.ray_dataset import RayDataset
+from pipeline.cli.terminal import PlainDisplay
 from stages.hardware.backend import chosen_backend
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_bytes
@@ -46,17 +47,6 @@ DIFFERENT = 4  # photos that are painted; the others are copies
 BATCHES = (4096, 8192)
 REPEATS = 100
 STEPS = 50  # of training
-
-
-class Spoken:
-    """A Progress that says what stays."""
-
-    def update(self, message: str, done: float | None = None) -> None:
-        """Say nothing."""
-
-    def note(self, code: str, text: str) -> None:
-        """Say it."""
-        print(f"  {text}")
 
 
 def paint(folder: Path, photos: int) -> Scene:
@@ -107,10 +97,10 @@ def draw(dataset: RayDataset, where: str, record: Record, repeats: int = REPEATS
 def train(ingest: Path, scene: Scene, downscale: float) -> dict[str, Any]:
     """The time of a step of training on a store that has been made, and the memory of the process that took it."""
     device = compute_device()
-    grid = HashGridOptions(backend=chosen_backend(device, Spoken()))
+    grid = HashGridOptions(backend=chosen_backend(device, PlainDisplay()))
     config = with_defaults(Config(grid=grid, space="contracted", view_dependence=True, downscale=downscale))
     config = field_of(config).with_sizes(config, scene, rays=math.inf)
-    dataset = training_dataset(ingest, scene, "train", downscale, Spoken()).to(device)
+    dataset = training_dataset(ingest, scene, "train", downscale, PlainDisplay()).to(device)
     trainer, step = make_trainer(config, scene, dataset, config.seed), itertools.count()
     taken = milliseconds(lambda: trainer.step(next(step), 0.0, 1.0), STEPS)
     grid = config.grid
@@ -143,7 +133,7 @@ def measure(ingest: Path, photos: int, downscale: float, record: Record) -> None
 
     def opened(what: str) -> RayDataset:
         started = time.perf_counter()
-        dataset = training_dataset(ingest, scene, "train", downscale, Spoken())
+        dataset = training_dataset(ingest, scene, "train", downscale, PlainDisplay())
         taken = round(1e3 * (time.perf_counter() - started))
         record.add(what=f"{what} of {photos} photos", median_ms=taken, lowest_ms=taken, **memory())
         return dataset

@@ -36,6 +36,7 @@ from nerf.synthetic.scenes import Solid, SyntheticScene, photograph
 from nerf.synthetic.shapes import Box
 from nerf.synthetic.textures import make_noise
 from stages import ingest, sfm
+from stages.contract import run_stage
 from stages.sfm.colmap.cameras import camera_rays
 from stages.sfm.colmap.models import read_model
 
@@ -95,7 +96,7 @@ def measure(config: sfm.Config, folder: Path, truth: dict[str, np.ndarray]) -> d
     """Run stage sfm; its row of the table."""
     progress, sfm_folder = Timed(), folder / str(config.matcher)
     begin = time.perf_counter()
-    result = sfm.run(config, {"ingest": folder / "ingest"}, sfm_folder, progress)
+    result = run_stage(sfm, config, {"ingest": folder / "ingest"}, sfm_folder, progress)
     seconds = time.perf_counter() - begin
     model = read_model(sfm_folder / "sparse")
     true = np.stack([truth[image.file] for image in model.images])[:, :, 3]

@@ -33,22 +33,13 @@ import numpy as np
 
 from benchmarks.record import Record, add_out
 from nerf.geometry.alignment import align
+from pipeline.cli.terminal import PlainDisplay
 from stages import ingest, sfm
+from stages.contract import run_stage
 from stages.io.photos import Photo, read_photos
 from stages.io.sparse_model import SparseModel
 from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.pose_files import read_poses
-
-
-class Quiet:
-    """A Progress that passes on what stays."""
-
-    def update(self, message: str, done: float | None = None) -> None:
-        """Say nothing."""
-
-    def note(self, code: str, text: str) -> None:
-        """Print the note."""
-        print(f"  {text}")
 
 
 def errors(model: SparseModel, reference: dict[str, dict[str, list]]) -> tuple[np.ndarray, np.ndarray]:
@@ -88,9 +79,9 @@ def measure(data: Path, config: sfm.Config) -> dict[str, Any]:
         folders = {name: Path(scratch, name) for name in ("ingest", "sfm")}
         folders["ingest"].mkdir()
         photos = data / "images" if transforms.exists() else data
-        ingest.run(ingest.Config(photos=photos), {}, folders["ingest"], Quiet())
+        ingest.run(ingest.Config(photos=photos), {}, folders["ingest"], PlainDisplay())
         begin = time.perf_counter()
-        result = sfm.run(config, folders, folders["sfm"], Quiet())
+        result = run_stage(sfm, config, folders, folders["sfm"], PlainDisplay())
         seconds = time.perf_counter() - begin
         model = read_model(folders["sfm"] / "sparse")
         if transforms.exists():

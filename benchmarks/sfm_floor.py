@@ -27,7 +27,7 @@ import numpy as np
 import pycolmap
 
 from benchmarks.record import Record, add_out
-from benchmarks.sfm_accuracy import Quiet
+from pipeline.cli.terminal import PlainDisplay
 from stages import ingest
 from stages.hardware.device import processors
 from stages.io.photos import Photo, read_photos
@@ -134,7 +134,10 @@ def main() -> None:
         folder = Path(scratch, "ingest")
         folder.mkdir()
         ingest.run(
-            ingest.Config(photos=source / "images" if (source / "images").is_dir() else source), {}, folder, Quiet()
+            ingest.Config(photos=source / "images" if (source / "images").is_dir() else source),
+            {},
+            folder,
+            PlainDisplay(),
         )
         photos = sorted(read_photos(folder), key=lambda photo: photo.file)
         compare(

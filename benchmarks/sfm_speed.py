@@ -26,6 +26,7 @@ import pycolmap
 from benchmarks.record import Record, add_out
 from benchmarks.sfm_accuracy import errors
 from stages import ingest, sfm
+from stages.contract import run_stage
 from stages.io.sparse_model import SparseModel
 from stages.sfm.colmap.models import read_model
 
@@ -77,7 +78,7 @@ def ours(photos: Path, folder: Path) -> tuple[Path, dict[str, float], str]:
     ingest.run(ingest.Config(photos=photos), {}, folders["ingest"], progress)
     parts = {"ingest": time.perf_counter() - begin}
     progress = Timed()
-    sfm.run(sfm.Config(), folders, folders["sfm"], progress)
+    run_stage(sfm, sfm.Config(), folders, folders["sfm"], progress)
     parts["sfm"] = time.perf_counter() - begin - parts["ingest"]
     return folders["sfm"] / "sparse", parts, progress.parts()
 

@@ -9,7 +9,7 @@ A stage is a package in this folder and one line in pipeline/engine/stage_list.p
 * ``PUBLISHED: tuple[str, ...]``: the outputs or records shown in ``<workspace>/output/``;
 * ``Config``: its settings, a :class:`StageConfig`;
 * ``run(config, inputs, folder, progress) -> StageResult``: reads ``inputs[stage]`` (finished folders), writes
-  into ``folder`` and nowhere else, raises :class:`StageError` for everything a user can act on;
+  into ``folder`` and nowhere else, raises :class:`StageError` for everything a user can act on. ``config`` is planned;
 
 and may have (:data:`DEFAULTS` hold otherwise)
 
@@ -17,8 +17,8 @@ and may have (:data:`DEFAULTS` hold otherwise)
   its key and are not brought up to date for it, nor given to it where damaged, so no output may depend on them;
 * ``NOT_HASHED: tuple[str, ...]``: options that cannot change the result and so do not enter the key;
 * ``plan(config, inputs, progress) -> Config``: replaces every ``None`` ("choose for me") by a value, where it must by
-  timing a piece of the work. It is called once, before the stage's first run; the answer is kept in run.json and
-  enters the stage's key, so a run that was killed goes on with the same choice;
+  timing a piece of the work. :func:`plan_stage` calls it, once, before the stage's first run; the answer is kept in
+  run.json and enters the stage's key, so a run that was killed continues with the same choice;
 * ``ON_REQUEST: bool``: nothing needs it, so it runs only where it is named, and no budget pays for it;
 * ``SUMMARY: bool``: it shows the whole run: of its ``INPUTS`` it takes what is there, with records and timings, and the
   account of a budget; it is brought up to date after whichever stage was run alone;
@@ -36,13 +36,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, NamedTuple, Protocol, Self
+from typing import Annotated, Any, NamedTuple, Protocol, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 from pydantic.fields import FieldInfo
-from tyro.conf import Suppress
+from tyro.conf import Suppress, arg
 
 MAX_LETTERS = 600  # of each part of an error
+T = TypeVar("T")
+# An option that is chosen for the user where it is None. Its help text says how, in the place of "(default: None)".
+Auto = Annotated[T | None, arg(help_behavior_hint="")]
 KEY_LENGTH = 16  # hex digits of a key that name a stage's folder: 64 bits
 
 
@@ -153,6 +156,18 @@ class StageResult:
 
 
 Inputs = Mapping[str, Path]
+C = TypeVar("C", bound=StageConfig)
+
+
+def plan_stage(stage: ModuleType, config: C, inputs: Inputs, progress: Progress) -> C:
+    """``config`` with every "choose for me" answered, by the stage's ``plan``; as it is for a stage without one."""
+    plan = declared(stage, "plan")
+    return config if plan is None else plan(config, inputs, progress)
+
+
+def run_stage(stage: ModuleType, config: StageConfig, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
+    """Plan and run a stage without a workspace: ``inputs`` are finished folders, ``folder`` an empty one."""
+    return stage.run(plan_stage(stage, config, inputs, progress), inputs, folder, progress)
 
 
 # --- what a stage declares about its time

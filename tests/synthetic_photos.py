@@ -9,6 +9,7 @@ from nerf.geometry.scene import Camera
 from nerf.synthetic.scenes import ring_of_cameras
 from pipeline.demo import write_photos
 from pipeline.demo.truth import Truth
+from pipeline.engine.display import SilentDisplay
 
 LENS = Camera("OPENCV", 240, 180, (250.5, 249.75, 120.6, 89.65, -0.085, 0.032, 0.0011, -0.0008))
 
@@ -30,15 +31,5 @@ def write_synthetic_photos(folder: Path) -> SyntheticPhotos:
     """The same in a folder of one's own."""
     poses = {f"photo_{index:03d}.jpg": pose for index, pose in enumerate(ring_of_cameras(36)[:12])}
     truth = Truth(LENS, poses, seed=0)
-    write_photos(folder, truth, Quiet())
+    write_photos(folder, truth, SilentDisplay())
     return SyntheticPhotos(folder, truth)
-
-
-class Quiet:
-    """A Progress that says nothing."""
-
-    def update(self, message: str, done: float | None = None) -> None:
-        pass
-
-    def note(self, code: str, text: str) -> None:
-        pass

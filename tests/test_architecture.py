@@ -275,6 +275,13 @@ def hidden_zeros(module: Module) -> Iterator[str]:
                     yield ast.unparse(node)
 
 
+def calls_of_plan(module: Module) -> Iterator[str]:
+    """Calls of a stage's plan() beside :func:`stages.contract.plan_stage`."""
+    for name in calls(module.tree):
+        if name.split(".")[-1] == "plan" and module.name != "stages/contract.py":
+            yield f"{name}()"
+
+
 def long_test_names(module: Module) -> Iterator[str]:
     for function in functions(module.tree):
         if function.name.startswith("test_") and function.name.count("_") > MAX_TEST_NAME_WORDS:
@@ -346,6 +353,14 @@ def test_inheritance_is_rare():
     assert offenders(unusual_bases, OURS) == []
 
 
+def test_stages_are_planned_in_one_place():
+    contract = [module for module in OURS if module.name == "stages/contract.py"]
+    assert "plan" in calls(contract[0].tree)
+    assert (
+        offenders(calls_of_plan, [*OURS, *(module for module in AROUND if module.name.startswith("benchmarks"))]) == []
+    )
+
+
 def test_names_of_tests_have_few_words():
     assert offenders(long_test_names, AROUND) == []
 
@@ -378,6 +393,7 @@ BROKEN: dict[Rule, list[tuple[str, str]]] = {
         ("nerf/a.py", "open('a')"),
     ],
     long_test_names: [("tests/a.py", f"def test{'_a' * (MAX_TEST_NAME_WORDS + 1)}(): 1")],
+    calls_of_plan: [("stages/a.py", "plan(config)"), ("benchmarks/a.py", "train.plan(config)")],
     users_of_pycolmap: [("stages/sfm/a.py", "import pycolmap")],
     names_without_a_subject: [("stages/sfm/utils.py", "")],
     long_functions: [("a.py", "def f():\n" + "    x = 1\n" * MAX_FUNCTION_LINES)],
@@ -432,3 +448,4 @@ def test_options_are_documented():
     options = [(f"{stage}.{name}", option) for stage in STAGES for name, option in STAGES[stage].Config.flags()]
     assert "train.grid.max_res" in dict(options)
     assert [name for name, option in options if not option.description] == []
+    assert [name for name, option in options if option.default is None and "default: " not in option.description] == []

@@ -196,7 +196,7 @@ class Backend(Protocol):
         threshold: float,
         jitter: Float[Tensor, "rays"],
         far: Float[Tensor, "rays"],
-        depth: Float64[Tensor, "rays"],
+        optical_depth: Float64[Tensor, "rays"],
         near: Float[Tensor, "rays"],
     ) -> None: ...
 
@@ -236,7 +236,7 @@ class Backend(Protocol):
         samples: Samples,
         sigma: Float[Tensor, "samples"],
         opacity_step: float,
-        depth: Float64[Tensor, "rays"],
+        optical_depth: Float64[Tensor, "rays"],
         accumulated: Float[Tensor, "rays"],
     ) -> ColourSamples: ...
 

@@ -48,7 +48,7 @@ def march_with_early_termination(
     """
     rays = mapped.rays
     active_rays, near = len(jitter), rays.near.clone()
-    depth, taken = torch.zeros_like(jitter, dtype=torch.float64), 0
+    optical_depth, taken = torch.zeros_like(jitter, dtype=torch.float64), 0
     while active_rays and taken < stepping.max_samples:
         length = _samples_per_ray(active_rays, jitter.device)
         this_round = stepping._replace(max_samples=min(length, stepping.max_samples - taken))
@@ -60,7 +60,7 @@ def march_with_early_termination(
         yield MarchingRound(samples, points, density)
         with span("march"):
             backend.finish_round(
-                this_round, samples, density.sigma, EARLY_STOP_TRANSMITTANCE, jitter, rays.far, depth, near
+                this_round, samples, density.sigma, EARLY_STOP_TRANSMITTANCE, jitter, rays.far, optical_depth, near
             )
             taken, active_rays = taken + this_round.max_samples, int((near < rays.far).sum())
 

@@ -2,9 +2,9 @@
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import redirect_stderr, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -14,6 +14,8 @@ from pydantic import ValidationError
 
 from pipeline.cli.options import UsageError, wrong_options
 from pipeline.engine.settings import Settings
+from pipeline.engine.stage_list import STAGES
+from stages.contract import Auto
 from stages.render import Config as RenderConfig
 from stages.train.config import FIELD_NAMES, PRESET_FIELDS
 from stages.train.config import Config as TrainConfig
@@ -22,20 +24,27 @@ T = TypeVar("T")
 
 Effects = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
-    tyro.conf.arg(metavar="NAME=on|off|auto", help="Force an effect on or off, or let the photos decide; repeatable."),
+    tyro.conf.arg(
+        metavar="NAME=on|off|auto", help="Turn an effect on or off, or let the photos decide (default: auto)."
+    ),
 ]
 More = Annotated[
     str | None,
     tyro.conf.arg(
         metavar="10m",
-        help="Go on from the finished training for so much longer (90s, 10m, 1h30m, or 500steps), with the recorded "
-        "options; what it gave so far is kept.",
+        help="Continue the finished training for this long (90s, 10m, 1h30m or 500steps), with the recorded options. "
+        "Its results so far are kept.",
+        help_behavior_hint="",
     ),
 ]
 
 BudgetOption = Annotated[
     str | None,
-    tyro.conf.arg(metavar="DURATION", help="Wall time for the whole command, like 90s, 10m or 1h30m."),
+    tyro.conf.arg(
+        metavar="DURATION",
+        help="Wall time for the whole command: 90s, 10m, 1h30m (default: no limit).",
+        help_behavior_hint="",
+    ),
 ]
 
 
@@ -44,63 +53,63 @@ class Common:
     """Options of every command that runs stages."""
 
     json: bool = False
-    """One JSON object a line instead of text."""
+    """Print one JSON object per line instead of text."""
     debug: bool = False
-    """Show the traceback of an error."""
+    """Print the traceback of an error."""
     replan: bool = False
-    """Choose again what was chosen automatically before: for every stage of a run, or the one that is named."""
+    """Choose again what was chosen automatically, for every stage of a run or for the one that is named."""
     verify: bool = False
-    """Read every file of finished results and compare it with its sha256; what is damaged is rebuilt."""
+    """Check the sha256 of every file of finished results, and rebuild what is damaged."""
 
 
 @dataclass
 class RunArguments:
-    """Photos in; cameras, radiance field, figures, video, mesh and report out."""
+    """Turn photos into cameras, a radiance field, quality figures, a video, a mesh and a report."""
 
     photos: tyro.conf.Positional[Path]
     """A folder of photos, a video, a transforms.json, or a folder with transforms_train.json."""
     settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
     common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """The workspace (default: <photos>.nerf in the current folder)."""
-    cameras: Path | None = None
-    """Known cameras for these photos: a transforms.json or a COLMAP model folder."""
-    match_exposure: str | None = None
-    """Render the video as this photo was exposed (its name; where the effect exposure is on)."""
+    output: Annotated[Auto[Path], tyro.conf.arg(aliases=["-o"])] = None
+    """The workspace folder (default: <photos>.nerf in the current folder)."""
+    cameras: Auto[Path] = None
+    """Poses to import: a transforms.json or a COLMAP model folder (default: structure-from-motion finds them)."""
+    match_exposure: Auto[str] = None
+    """Render the video with the exposure of this photo (its name), if the effect exposure is on."""
     effect: Effects = ()
     budget: BudgetOption = None
-    until: str | None = None
-    """The last stage to run."""
+    until: Auto[str] = None
+    """Stop after this stage (default: run all)."""
     more: More = None
-    from_: Annotated[str | None, tyro.conf.arg(name="from")] = None
-    """Run this stage and all after it again even if they are cached."""
-    config: Path | None = None
-    """A TOML file with options, tables named by stage; flags win over it."""
+    from_: Annotated[Auto[str], tyro.conf.arg(name="from")] = None
+    """Run this stage and all later ones again, even if they are cached."""
+    config: Auto[Path] = None
+    """A TOML file with a table of options per stage. Flags override it."""
 
 
 @dataclass
 class StageArguments:
-    """Bring one stage of a workspace up to date, with the recorded options plus the flags given."""
+    """Bring one stage of a workspace up to date, with the recorded options and the given flags."""
 
     workspace: tyro.conf.Positional[Path]
     """The workspace folder."""
     settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
     common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
-    cameras: Path | None = None
-    """render only: a file with the cameras to render, like output/transforms.json."""
-    match_exposure: str | None = None
-    """render only: render the video as this photo was exposed (its name)."""
+    cameras: Auto[Path] = None
+    """Only for render: a file with the cameras to render, such as output/transforms.json."""
+    match_exposure: Auto[str] = None
+    """Only for render: render with the exposure of this photo (its name)."""
     effect: Effects = ()
-    budget: str | None = None
-    """tradeoff only: how long the study may take, as in 30m."""
+    budget: Auto[str] = None
+    """Only for tradeoff: how long the study may take, such as 30m."""
     more: More = None
     force: bool = False
-    """Run it again even if it is cached."""
+    """Run the stage again, even if it is cached."""
 
 
 @dataclass
 class ResumeArguments:
-    """Repeat the recorded run: what is finished is kept, what was interrupted goes on."""
+    """Repeat the recorded run: finished stages are kept, an interrupted one continues."""
 
     workspace: tyro.conf.Positional[Path]
     common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
@@ -108,18 +117,18 @@ class ResumeArguments:
 
 @dataclass
 class StatusArguments:
-    """Each stage: cached, stale, partial or never, with its one-line summary."""
+    """Show the state of each stage (cached, stale, partial, never) and its result in one line."""
 
     workspace: tyro.conf.Positional[Path]
     json: bool = False
-    """One JSON array instead of text."""
+    """Print one JSON array instead of text."""
     verify: bool = False
-    """Read every file of finished results and compare it with its sha256; exit code 1 if one is damaged."""
+    """Check the sha256 of every file of finished results; exit code 1 if one is damaged."""
 
 
 @dataclass
 class ExplainArguments:
-    """Say whether a stage would run, and which part of its key changed."""
+    """Say whether a stage would run, and why."""
 
     stage: tyro.conf.Positional[str]
     workspace: tyro.conf.Positional[Path]
@@ -127,33 +136,33 @@ class ExplainArguments:
 
 @dataclass
 class CleanArguments:
-    """Remove results that the recorded options do not use."""
+    """Delete results that the recorded options do not use."""
 
     workspace: tyro.conf.Positional[Path]
     dry_run: bool = False
-    """Only list them."""
+    """List them without deleting them."""
 
 
 @dataclass
 class DoctorArguments:
-    """Versions, device, threads, free disk and a five-second numerical self-test."""
+    """Print versions, device, threads and free disk space, and run a five-second numerical self-test."""
 
     selftest: bool = False
-    """Measure every formula of docs/NUMERICS.md on this machine's device as well, in under a minute."""
+    """Also measure every formula of docs/NUMERICS.md on this device, in under a minute."""
     bench: bool = False
-    """Measure matrix products, random reads and copying as well, and say what training can reach here at most; 5 s."""
+    """Also measure matrix multiplication, random reads and copying, and the training speed they allow, in 5 s."""
 
 
 @dataclass
 class DemoArguments:
-    """Photograph a synthetic scene, run everything on the photos and compare with the truth."""
+    """Render photos of a synthetic scene, run all stages on them and compare the result with the truth."""
 
     settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
     common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
     effect: Effects = ()
     budget: BudgetOption = None
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
-    """Where photos and workspace go."""
+    """The folder for photos and workspace."""
 
 
 COMMANDS: dict[str, type] = {
@@ -167,18 +176,13 @@ COMMANDS: dict[str, type] = {
 }
 
 
-def parse(kind: type[T], command: str, words: Sequence[str], settings: Settings | None = None) -> T:
-    """Parse ``words``; stage options not named in them keep their value in ``settings``.
+def parse(kind: type[T], command: str, words: Sequence[str]) -> T:
+    """Parse ``words``; options of stages that they do not name have their defaults.
 
     Raises UsageError with every wrong word in a sentence of its own, SystemExit(0) after ``--help``.
     """
-    if settings is not None:
-        left = {"train": _without_replaced(settings.train, words), "render": _one_path(settings.render, command, words)}
-        settings = settings.model_copy(update=left)
     positional = {name: tyro.MISSING for name in ("photos", "workspace", "stage") if name in kind.__annotations__}
     default: Any = kind(**positional)
-    if settings is not None:
-        default = replace(default, settings=settings)
     said = io.StringIO()
     try:
         with redirect_stderr(said):
@@ -189,6 +193,38 @@ def parse(kind: type[T], command: str, words: Sequence[str], settings: Settings 
         if "photos" in positional and (surplus := _surplus_file(kind, words, default)):
             raise UsageError(f"{surplus} is one file too many; give the folder that holds the photos") from ending
         raise UsageError(f"{_what_is_wrong(ending, said.getvalue())} (pipeline {command} --help)") from ending
+
+
+def with_flags(settings: Settings, parsed: Settings, command: str, words: Sequence[str]) -> Settings:
+    """``settings`` (recorded, or from a file) with the options of stages that ``words`` name, as :func:`parse` read
+    them, and without those that these replace. Raises UsageError where they do not go together."""
+    left = {"train": _without_replaced(settings.train, words), "render": _one_path(settings.render, command, words)}
+    settings = settings.model_copy(update=left)
+    named = {(stage, name) for stage in STAGES for name in _named_options(stage, words)}
+    for stage in {stage for stage, _ in named}:
+        values = getattr(settings, stage).model_dump()
+        for name in (name for of, name in named if of == stage):
+            *parents, option = name.split(".")
+            table, given = values, getattr(parsed, stage)
+            for parent in parents:
+                table, given = table.setdefault(parent, {}), getattr(given, parent)
+            table[option] = getattr(given, option)
+        try:
+            settings = settings.model_copy(update={stage: STAGES[stage].Config.model_validate(values)})
+        except ValidationError as error:
+            raise UsageError(f"{wrong_options(error, f'--{stage}')} (pipeline {command} --help)") from error
+    return settings
+
+
+def _named_options(stage: str, words: Sequence[str]) -> Iterator[str]:
+    """The dotted names of the stage's options that ``words`` give, which may be spelt with underscores."""
+    flags = {word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")}
+    for name, option in STAGES[stage].Config.flags():
+        *parents, last = f"{stage}.{name}".replace("_", "-").split(".")
+        own = [".".join([*parents, last]), ".".join([*parents, f"no-{last}"])]
+        aliases = [alias for entry in option.metadata for alias in getattr(entry, "aliases", None) or ()]
+        if not flags.isdisjoint([*(f"--{flag}" for flag in own), *aliases]):
+            yield name
 
 
 def _surplus_file(kind: type, words: Sequence[str], default: Any) -> str | None:
@@ -257,12 +293,12 @@ def overview(stages: Sequence[str]) -> str:
     lines = [f"  {name:<10} {text}" for name, text in commands]
     return "\n".join(
         [
-            "usage: pipeline COMMAND … (pipeline COMMAND --help says more)",
+            "usage: pipeline COMMAND …   (details: pipeline COMMAND --help)",
             "",
-            "  pipeline run photos/       from photos to cameras, radiance field, video, mesh and report",
+            "  pipeline run photos/       photos in; cameras, radiance field, video, mesh and report out",
             "",
             *lines,
             "",
-            f"One stage of a workspace, with its options: pipeline STAGE WORKSPACE ({', '.join(stages)})",
+            f"To run one stage of a workspace: pipeline STAGE WORKSPACE ({', '.join(stages)})",
         ]
     )

@@ -130,22 +130,22 @@ def _command(name: str) -> Callable[[Sequence[str]], int]:
 def command_run(words: Sequence[str]) -> int:
     """``pipeline run PHOTOS``: the whole chain, or a part of it."""
     given = arguments.parse(arguments.RunArguments, "run", words)
+    settings = given.settings
     if given.more is not None and given.config is not None:
         what = f"--more uses the recorded options, not those of --config {given.config}"
         raise UsageError(f"{what}; leave --config out, and give what is to change as flags")
     file = {} if given.config is None else read_toml(given.config)
-    if given.config is not None:  # the file's values become the defaults that flags override
-        from_file = settings_from(file, f"--config {given.config}")
-        given = arguments.parse(arguments.RunArguments, "run", words, from_file)
+    if given.config is not None:  # flags win over it
+        settings = arguments.with_flags(settings_from(file, f"--config {given.config}"), settings, "run", words)
     root, cameras = given.output or default_workspace(given.photos), given.cameras
     check_workspace(root, given.photos)
     if given.output is None:
         check_same_photos(Workspace(root), given.photos)
     if given.more is not None:
         recorded = _recorded_settings(Workspace.existing(root))
-        given = arguments.parse(arguments.RunArguments, "run", words, recorded)
+        settings = arguments.with_flags(recorded, settings, "run", words)
         cameras = cameras or recorded.ingest.cameras
-    asked = _matching_exposure(with_effects(_more(given, root), given.effect), given.match_exposure)
+    asked = _matching_exposure(with_effects(_more(settings, given.more, root), given.effect), given.match_exposure)
     asked = _keeping_studies(asked, root, words, file)
     stages = stage_list.up_to(_known_stage(given.until or list(stage_list.STAGES)[-1], "--until"))
     force = frozenset[str]()
@@ -157,12 +157,12 @@ def command_run(words: Sequence[str]) -> int:
         raise UsageError(f"--budget and --until {studies[0]}: a study has a budget of its own; run first, then {later}")
     with choose_display(given.common.json) as display:
         try:
-            settings = with_source(asked, given.photos, cameras)
+            asked = with_source(asked, given.photos, cameras)
         except StageError as error:
             display.failed(stage_list.SOURCE, error)
             return exit_codes.of_stage(stage_list.SOURCE)
         new_budget = None if given.more is not None else (budget, 0.0)
-        return _run_stages(root, settings, stages, given.common, display, force, new_budget=new_budget)
+        return _run_stages(root, asked, stages, given.common, display, force, new_budget=new_budget)
 
 
 def _keeping_studies(settings: Settings, root: Path, words: Sequence[str], file: Collection[str] = ()) -> Settings:
@@ -191,9 +191,9 @@ def _budget(text: str | None, settings: Settings) -> float | None:
     return None if text is None else seconds_from(text)
 
 
-def _more(given: arguments.RunArguments | arguments.StageArguments, root: Path) -> Settings:
-    """The settings given, with ``--more``."""
-    return given.settings if given.more is None else with_more(given.settings, Workspace.existing(root), given.more)
+def _more(settings: Settings, more: str | None, root: Path) -> Settings:
+    """The settings with ``--more``, where it is given."""
+    return settings if more is None else with_more(settings, Workspace.existing(root), more)
 
 
 def _matching_exposure(settings: Settings, photo: str | None) -> Settings:
@@ -261,15 +261,15 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
     """``pipeline STAGE WORKSPACE``: bring one stage, what it needs, and the report if there is one, up to date."""
     given = arguments.parse(arguments.StageArguments, stage, words)
     workspace = Workspace.existing(given.workspace)
-    recorded = _recorded_settings(workspace)
-    given = arguments.parse(arguments.StageArguments, stage, words, recorded)
+    settings = arguments.with_flags(_recorded_settings(workspace), given.settings, stage, words)
     for flag in ("cameras", "match_exposure"):
         if getattr(given, flag) is not None and stage != "render":
             option = flag.replace("_", "-")
             raise UsageError(f"--{option} belongs to `pipeline render` and `pipeline run`, not to {stage}")
     if given.more is not None and stage != "train":
         raise UsageError(f"--more belongs to `pipeline train` and `pipeline run`, not to {stage}")
-    settings = _matching_exposure(with_effects(_more(given, given.workspace), given.effect), given.match_exposure)
+    settings = with_effects(_more(settings, given.more, given.workspace), given.effect)
+    settings = _matching_exposure(settings, given.match_exposure)
     if given.budget is not None:
         settings = _study_for(settings, given.budget, stage)
     if given.cameras is not None:
@@ -365,10 +365,11 @@ def command_demo(words: Sequence[str]) -> int:
     given = arguments.parse(arguments.DemoArguments, "demo", words)
     from pipeline import demo
 
+    settings = given.settings
     if given.budget is None:
-        given = arguments.parse(arguments.DemoArguments, "demo", words, demo.default_settings())
-    budget = _budget(given.budget, given.settings)
-    asked = with_effects(given.settings, given.effect)
+        settings = arguments.with_flags(demo.default_settings(), settings, "demo", words)
+    budget = _budget(given.budget, settings)
+    asked = with_effects(settings, given.effect)
     photos, root = given.output / "photos", given.output / "demo.nerf"
     asked = _keeping_studies(asked, root, words)
     with choose_display(given.common.json) as display:

@@ -27,7 +27,7 @@ from pipeline.schedule.forecast import (
     photos_of,
     time_behind_plan,
 )
-from stages.contract import StageConfig, StageError, Workload, declared, reading_seconds
+from stages.contract import StageConfig, StageError, Workload, declared, plan_stage, reading_seconds
 from stages.hardware.device import processors
 from stages.ingest.sources import find_source, is_gone
 from stages.io.photos import read_photos
@@ -293,12 +293,11 @@ class Runner:
         return self.done.get(name)
 
     def _planned(self, stage: str, inputs: dict[str, str], folders: dict[str, Path], may_plan: bool) -> StageConfig:
-        """The stage's config with every "choose for me" answered: from run.json, or by the stage's plan()."""
+        """The stage's config with every "choose for me" answered: from run.json, or by its plan."""
         module, options = STAGES[stage], getattr(self.settings, stage)
         if is_summary(stage, STAGES) and (account := self.run_file.budget):
             return module.Config.model_validate(options.model_dump() | {"budget": account.shown(STAGES)})
-        plan = declared(module, "plan")
-        if plan is None:
+        if declared(module, "plan") is None:
             return options
         options_for_key = self._config_for_key(stage, options)
         total = None if self.budget is None else self.budget.total
@@ -317,7 +316,7 @@ class Runner:
         self._begin_work(stage)
         clock = time.monotonic()
         with counting(self.workspace.root / RUNNING):
-            config = plan(self._with_time(stage, options), folders, self.display)
+            config = plan_stage(module, self._with_time(stage, options), folders, self.display)
         self.planning[stage] = time.monotonic() - clock
         plans[asked] = config.model_dump(mode="json")
         self.workspace.write_run(self.run_file)

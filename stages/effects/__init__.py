@@ -8,6 +8,7 @@ from pydantic import Field, field_validator
 from tyro.conf import Suppress
 
 from stages.contract import (
+    Auto,
     BudgetLeft,
     Inputs,
     Progress,
@@ -36,7 +37,7 @@ MIN_TIMED_SECONDS = 3.0  # in less no A/B run is made, and to find out takes one
 
 
 class Config(StageConfig):
-    """Which effects to model: decided by evidence, or by hand."""
+    """How it is decided which effects to model."""
 
     # --effect NAME=on|off|auto gives it.
     force: Annotated[dict[str, Switch], Suppress] = Field(
@@ -45,20 +46,22 @@ class Config(StageConfig):
     pilot_steps: int = Field(
         default=PILOT_STEPS,
         ge=0,
-        description="steps of each A/B training (pilot), where the evidence is not clear; 0: no pilots",
+        description=(
+            "Steps of each A/B training run (pilot), which decides where the statistics are unclear; 0: no pilots."
+        ),
     )
-    pilots: int | None = Field(
-        default=None, ge=0, description=f"how many at most; none: {MAX_PILOTS}, fewer where there is no time for them"
+    pilots: Auto[int] = Field(
+        default=None, ge=0, description="Maximum number of pilots (default: 2, fewer if there is too little time)."
     )
     fitting_pilots: Annotated[int | None, Suppress] = Field(
         default=None, ge=0, description="of these, how many may fit poses; none: all"
     )
-    seconds: float | None = Field(
+    seconds: Auto[float] = Field(
         default=None,
         ge=0,
-        description="that pilots may take; none: by the run, where it counts steps as long as they take",
+        description="Time limit of all pilots (default: from the budget; none for a run of --train.steps).",
     )
-    seed: int = Field(default=0, description="of the pilots")
+    seed: int = Field(default=0, description="Seed of the pilots.")
 
     @field_validator("force")
     @classmethod
@@ -116,4 +119,4 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     from stages.effects.study import study
 
     scene, registration = read_scene(inputs["normalise"]), read_json(inputs["sfm"] / "registration.json")
-    return study(plan(config, inputs, progress), scene, registration, inputs, folder, progress)
+    return study(config, scene, registration, inputs, folder, progress)

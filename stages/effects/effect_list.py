@@ -12,15 +12,15 @@ if TYPE_CHECKING:
     import numpy as np
 
     from nerf.effects import ColourEffect, RayEffect
-    from nerf.effects.statistics.statistic import Evidence
-    from stages.effects.evidence import Observations
+    from nerf.effects.statistics.statistic import Statistic
+    from stages.effects.scene_statistics import Observations
 
 
 class EffectParts(NamedTuple):
     """What an effect is made of. ``statistic`` tells whether the scene calls for it; ``measured``, what it begins with,
     (training images, numbers). ``rays`` or ``colours`` is its model; neither: it is the field's own (stages/train)."""
 
-    statistic: "Callable[[Observations], Evidence]"
+    statistic: "Callable[[Observations], Statistic]"
     measured: "Callable[[Observations], np.ndarray] | None" = None
     rays: "type[RayEffect] | None" = None
     colours: "type[ColourEffect] | None" = None
@@ -37,29 +37,29 @@ class Effect(NamedTuple):
 
 
 def _background() -> EffectParts:
-    from stages.effects.evidence import background_statistic
+    from stages.effects.scene_statistics import classify_background
 
-    return EffectParts(lambda seen: background_statistic(seen.places))
+    return EffectParts(lambda seen: classify_background(seen.places))
 
 
 def _exposure() -> EffectParts:
     from nerf.effects.exposure import ExposureModel
-    from stages.effects.evidence import exposure_statistic, measured_gains
+    from stages.effects.scene_statistics import classify_exposure, measured_gains
 
-    return EffectParts(exposure_statistic, measured_gains, colours=ExposureModel)
+    return EffectParts(classify_exposure, measured_gains, colours=ExposureModel)
 
 
 def _pose_refinement() -> EffectParts:
     from nerf.effects.pose_refinement import PoseRefinement
-    from stages.effects.evidence import pose_statistic
+    from stages.effects.scene_statistics import classify_poses
 
-    return EffectParts(lambda seen: pose_statistic(seen.places), rays=PoseRefinement)
+    return EffectParts(lambda seen: classify_poses(seen.places), rays=PoseRefinement)
 
 
 def _view_dependence() -> EffectParts:
-    from nerf.effects.statistics.view_dependence import view_dependence_evidence
+    from nerf.effects.statistics.view_dependence import view_dependence_statistic
 
-    return EffectParts(lambda seen: view_dependence_evidence(seen.tracks, seen.exposure))
+    return EffectParts(lambda seen: view_dependence_statistic(seen.tracks, seen.exposure))
 
 
 EFFECTS = [

@@ -10,25 +10,26 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from nerf.effects.statistics.statistic import Evidence
+from nerf.effects.statistics.statistic import Statistic
 from nerf.geometry.scene import Scene
 from nerf.training.trainer import NonFinite
 from stages.contract import Inputs, Progress, StageResult
-from stages.effects import evidence, pilots
+from stages.effects import pilots
 from stages.effects.decisions import Decisions, write_decisions
 from stages.effects.effect_list import EFFECTS, Effect
 from stages.effects.pilots import Pilot, PilotScene, fits_poses
+from stages.effects.scene_statistics import WARNINGS, camera_model_statistic, observed
 from stages.io.files import read_tensors, write_json
 
 if TYPE_CHECKING:
     from stages.effects import Config
 
 
-class SceneEvidence(NamedTuple):
+class SceneStatistics(NamedTuple):
     """The evidence by effect and warning, what effects begin with (training photos in order, numbers), and the
     ``seconds`` that the evidence took."""
 
-    of: dict[str, Evidence]
+    of: dict[str, Statistic]
     measured: dict[str, np.ndarray]
     seconds: dict[str, float]
 
@@ -48,7 +49,7 @@ class Clock:
         for name in names:
             self.seconds[name] = self.seconds.get(name, 0.0) + part
 
-    def timed(self, statistics: Mapping[str, Callable[[], Evidence]]) -> dict[str, Evidence]:
+    def timed(self, statistics: Mapping[str, Callable[[], Statistic]]) -> dict[str, Statistic]:
         """What each of them says; each counts for its own name."""
         said = {}
         for name, statistic in statistics.items():
@@ -57,22 +58,22 @@ class Clock:
         return said
 
 
-def scene_evidence(
+def scene_statistics(
     ingest: Path,
     scene: Scene,
     points: Mapping[str, np.ndarray],
     uncertainty_px: Mapping[str, float | None],
     progress: Progress,
-) -> SceneEvidence:
+) -> SceneStatistics:
     """Everything that can be told without training. ``points`` is points.safetensors, ``uncertainty_px`` what
     registration.json says of each photo by its file (``images/…``)."""
     clock, parts = Clock(), {effect.name: effect.load() for effect in EFFECTS}
-    with clock.runs_for(*parts, *evidence.WARNINGS):
-        seen = evidence.observed(ingest, scene, points, uncertainty_px, progress)
-    statistics = {name: each.statistic for name, each in parts.items()} | evidence.WARNINGS
+    with clock.runs_for(*parts, *WARNINGS):
+        seen = observed(ingest, scene, points, uncertainty_px, progress)
+    statistics = {name: each.statistic for name, each in parts.items()} | WARNINGS
     of = clock.timed({name: partial(statistic, seen) for name, statistic in statistics.items()})
     measured = {name: each.measured(seen) for name, each in parts.items() if each.measured}
-    return SceneEvidence(of, measured, clock.seconds)
+    return SceneStatistics(of, measured, clock.seconds)
 
 
 class Verdict(NamedTuple):
@@ -91,11 +92,11 @@ def study(
     started = time.perf_counter()
     uncertainty = {f"images/{image['file']}": image.get("uncertainty_px") for image in registration["images"]}
     points = read_tensors(inputs["normalise"] / "points.safetensors")
-    found = scene_evidence(inputs["ingest"], scene, points, uncertainty, progress)
+    found = scene_statistics(inputs["ingest"], scene, points, uncertainty, progress)
     statistics_seconds = time.perf_counter() - started
     decisions, verdicts = _Study(config, scene, inputs, found, progress).decide()
     write_decisions(folder, decisions)
-    camera_model = evidence.camera_model_evidence(registration)
+    camera_model = camera_model_statistic(registration)
     of = found.of | {"camera_model": camera_model}
     seconds = found.seconds | {"camera_model": 0.0}  # stage sfm chose it
     verdicts["camera_model"] = Verdict(bool(camera_model.called_for), camera_model.words)
@@ -114,7 +115,7 @@ class _Study:
         config: "Config",
         scene: Scene,
         inputs: Inputs,
-        found: SceneEvidence,
+        found: SceneStatistics,
         progress: Progress,
     ) -> None:
         self.config, self.scene, self.inputs, self.found, self.progress = config, scene, inputs, found, progress
@@ -142,17 +143,17 @@ class _Study:
 
     def _verdict(self, effect: Effect, off: Decisions, on: Decisions) -> Verdict:
         asked = self.config.force.get(effect.name)
-        evidence, default = self.found.of[effect.name], effect.part_of_the_method
+        statistic, default = self.found.of[effect.name], effect.part_of_the_method
         if asked is not None:
-            return Verdict(asked == "on", f"asked for; {evidence.words}")
+            return Verdict(asked == "on", f"asked for; {statistic.words}")
         # Highlights have no tracks: what is seen of view dependence is a lower bound, and too little of it no proof.
-        unproven = default and evidence.called_for is False
-        if evidence.called_for is not None and not unproven:
-            return Verdict(evidence.called_for, evidence.words)
-        if math.isinf(evidence.noise):
-            return Verdict(default, evidence.words)
+        unproven = default and statistic.called_for is False
+        if statistic.called_for is not None and not unproven:
+            return Verdict(statistic.called_for, statistic.words)
+        if math.isinf(statistic.noise):
+            return Verdict(default, statistic.words)
         if why := self._why_no_pilot(off, on):
-            return Verdict(default, f"{evidence.words}; not clear, and no pilot: {why}")
+            return Verdict(default, f"{statistic.words}; not clear, and no pilot: {why}")
         return self._piloted(effect, off, on)
 
     def _why_no_pilot(self, off: Decisions, on: Decisions) -> str | None:
@@ -180,21 +181,21 @@ class _Study:
         return Verdict(stays, f"{words}; {gain}", pilot)
 
 
-def _entry(verdict: Verdict | None, evidence: Evidence, seconds: float) -> dict[str, Any]:
+def _entry(verdict: Verdict | None, statistic: Statistic, seconds: float) -> dict[str, Any]:
     """One effect in effects.json, whose statistic took ``seconds``; without a verdict it is only seen."""
     pilot = verdict.pilot if verdict else None
     return {
-        "on": verdict.on if verdict else bool(evidence.called_for),
+        "on": verdict.on if verdict else bool(statistic.called_for),
         "modelled": verdict is not None,
-        "statistic": _finite(evidence.statistic),
-        "unit": evidence.unit,
-        "threshold": _finite(evidence.threshold),
-        "noise": _finite(evidence.noise),
+        "statistic": _finite(statistic.value),
+        "unit": statistic.unit,
+        "threshold": _finite(statistic.threshold),
+        "noise": _finite(statistic.noise),
         "pilot_gain_db": pilot.gain_db if pilot else None,
         "pilot_noise_db": pilot.noise_db if pilot else None,
         "cost": pilot.cost if pilot else None,
         "seconds": round(seconds + (verdict.seconds if verdict else 0.0), 3),
-        "reason": verdict.reason if verdict else evidence.words,
+        "reason": verdict.reason if verdict else statistic.words,
     }
 
 

@@ -35,7 +35,7 @@ DARKEST, BRIGHTEST = 3, MIN_SATURATED  # of 255
 DECODING_BYTES = 2 << 30  # of photos in memory at a time
 
 
-class PhotoEvidence(NamedTuple):
+class SampledColours(NamedTuple):
     """``tracks``: observed points; ``expected``: places where points should be seen and have no observation."""
 
     tracks: TrackColours
@@ -49,7 +49,7 @@ class _Places(NamedTuple):
     window: np.ndarray
 
 
-def look_at_photos(ingest: Path, scene: Scene, points: Mapping[str, np.ndarray], progress: Progress) -> PhotoEvidence:
+def sample_photos(ingest: Path, scene: Scene, points: Mapping[str, np.ndarray], progress: Progress) -> SampledColours:
     """All that is read off the pixels of the training photos, each decoded once; test photos are not looked at.
 
     Tracks are at most MAX_OBSERVATIONS, whole ones evenly drawn; ``points`` is points.safetensors of normalise. Windows
@@ -75,7 +75,7 @@ def look_at_photos(ingest: Path, scene: Scene, points: Mapping[str, np.ndarray],
         pool.shutdown(cancel_futures=True)
     both = replace(both, colour=seen[:, :3], saturated=seen[:, 3] > 0, texture=seen[:, 4])
     there, observed = np.isfinite(seen[:, 0]), np.arange(len(both)) < len(tracks)
-    return PhotoEvidence(both.only(there & observed), both.only(there & ~observed))
+    return SampledColours(both.only(there & observed), both.only(there & ~observed))
 
 
 def training_tracks(scene: Scene, points: Mapping[str, np.ndarray], most: int) -> tuple[TrackColours, np.ndarray]:

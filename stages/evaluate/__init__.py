@@ -10,7 +10,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from stages.contract import Flexible, Inputs, Progress, StageConfig, StageResult, Workload
+from stages.contract import Auto, Flexible, Inputs, Progress, StageConfig, StageResult, Workload
 from stages.evaluate.seconds import SHARE, other_seconds
 from stages.train import trained_seconds
 
@@ -24,32 +24,34 @@ FLEXIBLE = Flexible(share=0.05, min_seconds=3.0, max_seconds=60.0)
 
 
 class Config(StageConfig):
-    """Settings of stage evaluate."""
+    """How test photos are scored."""
 
-    downscale: float | None = Field(
+    downscale: Auto[float] = Field(
         default=None,
         ge=1,
-        description="photo width / width of the scores (default: 1, more where the longer side has over 1600 pixels)",
+        description=(
+            "Photo width divided by scored width (default: 1; more if the longer side has more than 1600 pixels)."
+        ),
     )
-    fraction: float | None = Field(
+    fraction: Auto[float] = Field(
         default=None,
         gt=0,
         le=1,
-        description="fraction of each test photo to score, in tiles spread over it (default: as much as there is time "
-        "for)",
+        description="Fraction of each test photo to score, in tiles spread over it (default: as time allows).",
     )
-    background: Literal["white", "black"] | None = Field(
+    background: Auto[Literal["white", "black"]] = Field(
         default=None,
-        description="what photos with alpha are shown over (default: what the field was trained over, white where that "
-        "was random)",
+        description="Background behind transparent pixels (default: as in training; white if that was random).",
     )
     fit_poses: Literal["auto", "on", "off"] = Field(
         default="auto",
-        description="whether to score right halves at poses fitted on the left halves, too; auto: where training "
-        "refined poses; only for a hash-grid field",
+        description=(
+            "Also score the right half of each test photo at a pose fitted to its left half; auto: if training "
+            "refined poses. Only for a hash-grid field."
+        ),
     )
-    seconds: float | None = Field(
-        default=None, gt=0, description="time limit of the stage (default: rendering takes a tenth of the training)"
+    seconds: Auto[float] = Field(
+        default=None, gt=0, description="Time limit in seconds (default: a tenth of the training time for rendering)."
     )
 
 
@@ -74,7 +76,6 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """Render the test photos, compare, and write metrics.json, renders/ and errors/."""
     from stages.evaluate.scoring import load, save, score
 
-    config = plan(config, inputs, progress)
     scorer = load(config, inputs, progress)
     images = score(scorer, folder, progress)
     return save(scorer, images, folder)

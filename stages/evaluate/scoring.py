@@ -128,12 +128,14 @@ class Scorer:
         scored, pixels = mask, None  # the picture of a whole photo shows also what is not scored
         if tiles is not None:
             scored = pixels = tiles.mask(height, width) if mask is None else tiles.mask(height, width) & mask
-        rendering = self._render(self._renderer(view), self._rays(view), pixels, on_chunk)
+        renderer = self.renderer.through(photo_effects(self.field, self.scene, view, self.renderer.device))
+        rendering = self._render(renderer, self._rays(view), pixels, on_chunk)
         image, background = rendering.colour.clamp(0, 1), self.renderer.background.cpu()
         right, exposure_fitted = right_half_psnr(rendering, background, truth, scored)
         pose_fitted = None
         if self.fits_poses and right is not None:
-            _, pose_fitted = right_half_psnr(self._at_fitted_pose(view, truth, scored), background, truth, scored)
+            fitted = self._at_fitted_pose(renderer, view, truth, scored)
+            _, pose_fitted = right_half_psnr(fitted, background, truth, scored)
         nearest = nearest_view(view, self.scene.of_split("train"))
         return {
             "name": view.name,
@@ -145,17 +147,17 @@ class Scorer:
             "psnr_exposure_fitted": exposure_fitted,
             "psnr_pose_fitted": pose_fitted,
             "nearest_view": nearest.name,
-            **self._write_pictures(view, image if tiles is None else None, truth, mask, folder),
+            **self._write_pictures(renderer, view, image if tiles is None else None, truth, mask, folder),
         }
 
     def _write_pictures(
-        self, view: View, image: Tensor | None, truth: Tensor, mask: Tensor | None, folder: Path
+        self, renderer: Renderer, view: View, image: Tensor | None, truth: Tensor, mask: Tensor | None, folder: Path
     ) -> dict[str, str]:
         """The picture and its error map. Of a photo scored in tiles, whose ``image`` has holes, a smaller whole one."""
         if image is None:
             camera = self.scene.cameras[view.camera]
             downscale = camera.width / truth.shape[1] / math.sqrt(PREVIEW_SHARE * self.fraction)
-            image = self._renderer(view).render(view_rays(self.scene, view, downscale)).colour.clamp(0, 1)
+            image = renderer.render(view_rays(self.scene, view, downscale)).colour.clamp(0, 1)
             truth = resized(truth, *image.shape[:2])
             mask = view_mask(self.ingest, self.scene, view, downscale)
         # The decoded file has an ASCII name that is unique up to its suffix; the photo's own may be anything.
@@ -164,14 +166,14 @@ class Scorer:
         write_png(folder / "errors" / file, error_map(image, truth, mask))
         return {"render": f"renders/{file}", "error": f"errors/{file}"}
 
-    def _at_fitted_pose(self, view: View, truth: Tensor, scored: Tensor | None) -> Rendering:
+    def _at_fitted_pose(self, renderer: Renderer, view: View, truth: Tensor, scored: Tensor | None) -> Rendering:
         """The view from where its left half says that it was taken."""
         field, rays, background = self.renderer.field, self._rays(view), self.renderer.background.cpu()
         assert isinstance(field, HashGridField), "only with a hash-grid field does evaluate fit poses"
-        rendering = self._render(self._renderer(view), rays, scored)
+        rendering = self._render(renderer, rays, scored)
         effects = photo_effects(self.field, self.scene, view)
         moved = from_fitted_pose(field.on_cpu(), rays, rendering, background, truth, scored, effects)
-        return self._render(self._renderer(view), moved, scored)
+        return self._render(renderer, moved, scored)
 
     @staticmethod
     def _render(
@@ -210,9 +212,6 @@ class Scorer:
 
     def _rays(self, view: View) -> Rays:
         return view_rays(self.scene, view, self.downscale)
-
-    def _renderer(self, view: View) -> Renderer:
-        return self.renderer.through(photo_effects(self.field, self.scene, view, self.renderer.device))
 
 
 def _psnr(image: Tensor, truth: Tensor, used: Tensor | None) -> float:

@@ -29,7 +29,7 @@ MIN_FRAMES = 3  # of a video, as sfm needs
 
 
 class Config(StageConfig):
-    """Where the photos are."""
+    """Which photos are read."""
 
     photos: SourcePath = Field(
         default=Path(),
@@ -41,8 +41,7 @@ class Config(StageConfig):
     frames: int = Field(
         default=300,
         ge=MIN_FRAMES,
-        description="At most so many frames are taken from a video; where the camera moves far, they are further "
-        "apart.",
+        description=("Maximum number of frames taken from a video; they are further apart where the camera moves far."),
     )
 
 

@@ -10,7 +10,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from stages.contract import Flexible, Inputs, Progress, StageConfig, StageResult, Workload
+from stages.contract import Auto, Flexible, Inputs, Progress, StageConfig, StageResult, Workload
 from stages.train import trained_seconds
 
 INPUTS = ("ingest", "normalise", "train")
@@ -26,28 +26,30 @@ Keep = Literal["visible", "largest", "all"]
 
 
 class Config(StageConfig):
-    """Settings of stage mesh."""
+    """How the mesh is extracted."""
 
-    resolution: int | None = Field(
+    resolution: Auto[int] = Field(
         default=None,
         ge=16,
         le=1024,
-        description="grid points per edge of a cube; a flat box has as many in all (default: from the training)",
+        description=(
+            "Density grid points along an edge of a cube; a flat box has as many in all (default: from the training)."
+        ),
     )
-    seconds: float | None = Field(
-        default=None, gt=0, description="time limit of the stage (default: about a tenth of the training)"
+    seconds: Auto[float] = Field(
+        default=None, gt=0, description="Time limit in seconds (default: about a tenth of the training time)."
     )
-    iso_level: float | None = Field(
-        default=None, gt=0, description="density of the surface (default: where the photos' rays stop)"
+    iso_level: Auto[float] = Field(
+        default=None, gt=0, description="Density at the surface (default: where the photos' rays terminate)."
     )
-    keep: Keep = Field(default="visible", description="parts of the raw surface to keep")
-    min_views: int = Field(default=2, ge=1, description="photos that must see a part for it to count as visible")
+    keep: Keep = Field(default="visible", description="Components of the surface to keep.")
+    min_views: int = Field(default=2, ge=1, description="Photos that must see a component for it to count as visible.")
     min_component: float = Field(
-        default=0.01, ge=0, le=1, description="smallest component kept, as a fraction of the largest one's area"
+        default=0.01, ge=0, le=1, description="Area of the smallest component kept, as a fraction of the largest one's."
     )
-    max_faces: int = Field(default=300_000, ge=100, description="faces left after decimation")
-    formats: tuple[Format, ...] = Field(default=("glb", "ply"), min_length=1, description="file formats to write")
-    frame: Literal["sfm", "scene"] = Field(default="sfm", description="coordinate frame of the files")
+    max_faces: int = Field(default=300_000, ge=100, description="Maximum number of faces after decimation.")
+    formats: tuple[Format, ...] = Field(default=("glb", "ply"), min_length=1, description="File formats to write.")
+    frame: Literal["sfm", "scene"] = Field(default="sfm", description="Coordinate frame of the files.")
 
 
 def expected_seconds(config: Config, workload: Workload) -> float | None:
@@ -71,7 +73,6 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """Extract the mesh; write it in every format asked for, and a picture of it."""
     from stages.mesh.extraction import extract_mesh, load, save
 
-    config = plan(config, inputs, progress)
     source = load(inputs, progress)
     extracted = extract_mesh(config, source, progress)
     progress.update("writing", 0.95)

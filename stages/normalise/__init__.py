@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from stages.contract import Inputs, Progress, StageConfig, StageResult, Workload
+from stages.contract import Auto, Inputs, Progress, StageConfig, StageResult, Workload
 
 INPUTS = ("ingest", "sfm")
 VERSION = 17
@@ -14,14 +14,21 @@ PUBLISHED = ("transforms.json", "scene.json")
 
 
 class Config(StageConfig):
-    """Settings of stage normalise."""
+    """The region of interest and the test photos."""
 
-    roi: tuple[float, float, float, float] | None = Field(
+    roi: Auto[tuple[float, float, float, float]] = Field(
         default=None,
-        description="centre x, y, z and half side of the region of interest, in the frame of output/transforms.json",
+        description=(
+            "Region of interest: its centre x, y, z and half its side, in the frame of output/transforms.json "
+            "(default: from the cameras and points)."
+        ),
     )
     test_every: int = Field(
-        default=8, ge=2, description="hold out every n-th photo by name, from the first (imported splits are kept)"
+        default=8,
+        ge=2,
+        description=(
+            "Hold out every n-th photo by name as a test photo, from the first one; imported splits are kept."
+        ),
     )
 
 

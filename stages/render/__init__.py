@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pydantic import Field, field_validator
 
-from stages.contract import Flexible, Inputs, Progress, StageConfig, StageResult, Workload
+from stages.contract import Auto, Flexible, Inputs, Progress, StageConfig, StageResult, Workload
 from stages.io.files import read_scene, write_json
 from stages.render.plan import MIN_WIDTH, PathKind, even_width
 from stages.train import trained_seconds
@@ -20,45 +20,50 @@ FLEXIBLE = Flexible(share=0.15, min_seconds=4.0, max_seconds=300.0)
 
 
 class Config(StageConfig):
-    """Settings of stage render. Open ones are chosen so that rendering takes less time than training did."""
+    """The video. Its default size takes less time to render than the field took to train."""
 
-    path: PathKind | None = Field(
+    path: Auto[PathKind] = Field(
         default=None,
-        description="camera path (default: orbit around an object, spiral for a forward-facing capture, "
-        "else interpolated)",
+        description=(
+            "Camera path (default: orbit around an object, spiral for a forward-facing capture, else interpolated)."
+        ),
     )
-    cameras: Path | None = Field(
+    cameras: Auto[Path] = Field(
         default=None,
-        description="render the cameras of this file instead of a path: a transforms.json in the frame of "
-        "output/transforms.json, or a path.json of this stage",
+        description=(
+            "Render the cameras in this file instead of a path: a transforms.json in the frame of "
+            "output/transforms.json, or a path.json of this stage (default: a path)."
+        ),
     )
-    frames: int | None = Field(
-        default=None, ge=2, description="number of frames (default: as time allows, usually 24 to 120)"
+    frames: Auto[int] = Field(
+        default=None, ge=2, description="Number of frames (default: as time allows, usually 24 to 120)."
     )
-    width: int | None = Field(
+    width: Auto[int] = Field(
         default=None,
         ge=MIN_WIDTH,
         le=8192,
-        description="width in pixels, rounded to an even number (default: as time allows)",
+        description="Width in pixels, rounded to an even number (default: as time allows).",
     )
-    fps: int | None = Field(
+    fps: Auto[int] = Field(
         default=None,
         ge=1,
         le=120,
-        description="frames per second (default: 30; fewer for a video of fewer than 120 frames)",
+        description="Frames per second (default: 30; fewer for a video of fewer than 120 frames).",
     )
-    seconds: float | None = Field(
+    seconds: Auto[float] = Field(
         default=None,
         gt=0,
-        description="time limit of the stage (default: rendering takes 30 % of the training time)",
+        description="Time limit in seconds (default: 30 % of the training time).",
     )
-    depth: bool = Field(default=True, description="also write depth.mp4")
-    match_exposure: str | None = Field(
+    depth: bool = Field(default=True, description="Also write depth.mp4.")
+    match_exposure: Auto[str] = Field(
         default=None,
-        description="render with the exposure of this photo (its name), if the field models exposure "
-        "(default: the reference exposure)",
+        description=(
+            "Render with the exposure of this photo (its name), if the field models exposure (default: the "
+            "reference exposure)."
+        ),
     )
-    save_frames: bool = Field(default=False, description="also save every frame as PNG in frames/")
+    save_frames: bool = Field(default=False, description="Also save every frame as a PNG file in frames/.")
 
     @field_validator("cameras")
     @classmethod
@@ -93,8 +98,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     from stages.render import video
     from stages.render.renderer import load_renderer
 
-    config = plan(config, inputs, progress)
-    assert config.width is not None and config.fps is not None
+    assert config.width is not None and config.fps is not None, "plan() chooses them"
     scene = read_scene(inputs["normalise"])
     renderer = load_renderer(inputs["train"], progress=progress)
     renderer, appearance = video.with_appearance(renderer, config.match_exposure, inputs["train"], scene, progress)

@@ -30,10 +30,12 @@ class Account(StageConfig):
 
 
 class Config(StageConfig):
-    """Settings of stage report."""
+    """What the report contains."""
 
     video_limit_mb: float = Field(
-        default=12, ge=0, description="A larger video lies beside the page and not inside it."
+        default=12,
+        ge=0,
+        description="A video larger than this many megabytes is linked instead of embedded in the page.",
     )
     budget: Annotated[Account | None, Suppress] = Field(
         default=None, description="What the runner knows of the time given to the run; no flag is offered for it."

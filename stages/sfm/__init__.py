@@ -6,6 +6,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from stages.contract import (
+    Auto,
     BudgetLeft,
     Inputs,
     OptionalSourcePath,
@@ -36,73 +37,89 @@ BUDGET_SHARE = 0.5  # of a budget: what it may take before it extracts fewer fea
 
 
 class Config(StageConfig):
-    """How the cameras are found."""
+    """How camera poses and intrinsics are found."""
 
     cameras: OptionalSourcePath = Field(
         default=None,
         description="Poses to import: a transforms.json, a folder with transforms_train.json, or a COLMAP model.",
     )
-    pose_direction: Direction | None = Field(
+    pose_direction: Auto[Direction] = Field(
         default=None,
-        description="What the matrices of imported poses are (default: world-from-camera in transforms files, "
-        "camera-from-world in COLMAP models).",
+        description=(
+            "Direction of the matrices of imported poses (default: world-from-camera in transforms files, "
+            "camera-from-world in COLMAP models)."
+        ),
     )
-    camera_axes: CameraAxes | None = Field(
+    camera_axes: Auto[CameraAxes] = Field(
         default=None,
-        description="Where the camera axes of imported poses point: opencv (x right, y down, z forward) or opengl "
-        "(x right, y up, z back) (default: opengl in transforms files, opencv in COLMAP models).",
+        description=(
+            "Camera axes of imported poses: opencv (x right, y down, z forward) or opengl (x right, y up, z back) "
+            "(default: opengl in transforms files, opencv in COLMAP models)."
+        ),
     )
     seed: int = Field(
         default=0,
         ge=0,
         lt=2**31,
-        description="Seed of matching and mapping (docs/experiments/camera_models.md says how far runs repeat).",
+        description="Seed of matching and mapping.",
     )
-    max_image_size: int | None = Field(
+    max_image_size: Auto[int] = Field(
         default=None,
         ge=100,
-        description="Longer side in pixels at which features are extracted; larger photos are downscaled "
-        "(default: 1600, less where --sfm.seconds or a budget leaves too little time).",
+        description=(
+            "Longer side in pixels at which features are extracted; larger photos are downscaled (default: 1600, "
+            "less if --sfm.seconds or a budget leaves too little time)."
+        ),
     )
-    max_features: int | None = Field(
+    max_features: Auto[int] = Field(
         default=None,
         ge=100,
-        description="Features per photo, the largest first; matching time grows with its square "
-        "(default: 4096, fewer where --sfm.seconds or a budget leaves too little time).",
+        description=(
+            "Maximum number of features per photo, the largest first; matching time grows with its square "
+            "(default: 4096, fewer if --sfm.seconds or a budget leaves too little time)."
+        ),
     )
-    camera_model: CameraModel | None = Field(
+    camera_model: Auto[CameraModel] = Field(
         default=None,
-        description="COLMAP's camera model (default: SIMPLE_RADIAL while mapping, then the simplest one that "
-        "held-out observations support).",
+        description=(
+            "COLMAP camera model (default: SIMPLE_RADIAL for mapping, then the simplest one that held-out "
+            "observations support)."
+        ),
     )
-    camera_params: tuple[float, ...] | None = Field(
+    camera_params: Auto[tuple[float, ...]] = Field(
         default=None,
-        description="Known parameters of --sfm.camera-model in COLMAP's order, for photos of this size; they are "
-        "not refined.",
+        description=(
+            "Known parameters of --sfm.camera-model in COLMAP's order, for photos of this size; they are not "
+            "refined (default: estimated)."
+        ),
     )
-    matcher: Matcher | None = Field(
+    matcher: Auto[Matcher] = Field(
         default=None,
-        description="How image pairs are selected: all, by time, by GPS position, or by image retrieval; all but "
-        "exhaustive then follow the verified pairs (default: exhaustive up to 50 photos, else by what EXIF tells).",
+        description=(
+            "How image pairs are selected: all pairs, by time, by GPS position, or by image retrieval (default: "
+            "exhaustive for up to 50 photos, else by what EXIF tells)."
+        ),
     )
-    neighbours: int = Field(default=30, ge=1, description="Partners of each photo, where not all pairs are matched.")
+    neighbours: int = Field(default=30, ge=1, description="Pairs per photo, where not all pairs are matched.")
     max_strategies: int = Field(
         default=MAX_STRATEGIES,
         ge=1,
         le=MAX_STRATEGIES,
-        description="How many retry strategies may be tried while photos are unregistered; 1: only the default one.",
+        description="How many strategies to try while images are unregistered; 1 tries the default strategy only.",
     )
-    seconds: float | None = Field(
+    seconds: Auto[float] = Field(
         default=None,
         gt=0,
-        description="Time to aim for: extraction quality is lowered where it would take longer, and retry strategies "
-        "that would not fit are skipped; structure-from-motion is not aborted for it (default: no limit).",
+        description=(
+            "Time to aim for: fewer features are extracted if needed, and retry strategies that do not fit are "
+            "skipped. Mapping is not aborted (default: no limit)."
+        ),
     )
     max_seconds: float = Field(
         default=4 * 3600.0,
         gt=0,
-        description="Structure-from-motion is aborted after this time; its matches are kept for the next run. Retry "
-        "strategies that would not fit are skipped.",
+        description="Abort after this many seconds; the matches are kept for the next run. Retry strategies that do "
+        "not fit are skipped.",
     )
 
 
@@ -142,7 +159,6 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """Write ``sparse/`` and registration.json. Raises StageError where no usable model comes out."""
     from stages.sfm import reconstruction
 
-    config = plan(config, inputs, progress)
     folder.mkdir(parents=True, exist_ok=True)
     registration, skipped = reconstruction.find_cameras(config, inputs["ingest"], folder, progress)
     write_json(folder / "registration.json", registration)

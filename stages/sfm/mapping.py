@@ -1,6 +1,7 @@
 """From matches to a model whose poses pass the check, compared with global mapping. Runs in the worker process."""
 
 import shutil
+from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ from stages.sfm.colmap.diagnosis import compare_models, disagree
 from stages.sfm.colmap.mapping import incremental_options, map_globally, map_incrementally
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import (
-    Checked,
+    Candidate,
     agreeing_pairs,
     better,
     check_model,
@@ -30,12 +31,14 @@ from stages.sfm.retry_strategies import STRATEGIES, MappingOptions, Strategy
 
 class CheckedModel(NamedTuple):
     """The model with only the images that passed the check, by name why others are excluded, whether the sequence of
-    photos was broken in it, and whether it fits the matches as a whole."""
+    photos was broken in it, and whether it fits the matches as a whole. ``checks``: of all models that were checked and
+    have kept their images since."""
 
     model: Any
     excluded: dict[str, str]
     sequence_broken: bool
     fits: bool
+    checks: Sequence[Candidate] = ()
 
 
 def run_mapping(
@@ -71,17 +74,21 @@ def run_mapping(
         found[0] = checked.model
         if other is not None:  # where it was taken itself, it is compared with the one that it replaced
             rejected = before if found[0] is other else other
-            compared = _comparison(found[0], rejected, database, state) | {"taken": found[0] is other}
+            compared = _comparison(found[0], rejected, checked.checks, database, state)
+            compared["taken"] = found[0] is other
     state.end("mapping")
     return found, checked, compared
 
 
-def _comparison(model: Any, other: Any, database: Path, state: JobState) -> dict[str, Any]:
+def _comparison(model: Any, other: Any, checks: Sequence[Candidate], database: Path, state: JobState) -> dict[str, Any]:
     """How the models of incremental and global mapping compare, the one that was taken first; and where they differ,
     how many verified pairs agree with either."""
     compared = compare_models(model, other) | {"failed": None, "agreeing": None, "agreeing_other": None}
     if compared["different"]:
-        taken, rejected = ((one, check_model(one, database, state.job.seed)) for one in (model, other))
+        known = {id(one): checked for one, checked in checks}
+        taken, rejected = (
+            (one, known.get(id(one)) or check_model(one, database, state.job.seed)) for one in (model, other)
+        )
         compared["agreeing"], compared["agreeing_other"] = agreeing_pairs(taken, rejected, compared["different"])
     return compared
 
@@ -98,9 +105,11 @@ def _checked(model: Any, other: Any, database: Path, matches: Path, options: Any
     """The model without the images that fail the check. These are registered again first, in the model of global
     mapping where that fits the verified matches better."""
     best, sequence = (model, check_model(model, database, state.job.seed)), capture_sequence(database, state)
+    checks = [best]
     if not fragments_sequence(best[1], sequence):
         if other is not None and (best[1].failed() or disagree(model, other)):
-            best = better(best, (other, check_model(other, database, state.job.seed)))
+            checks.append((other, check_model(other, database, state.job.seed)))
+            best = better(*checks)
             if best[0] is other:
                 state.send(
                     note=Note(
@@ -118,13 +127,17 @@ def _checked(model: Any, other: Any, database: Path, matches: Path, options: Any
                 )
             )
             again = register_again(*best, matches, state.images, Path(state.job.folder, "again"), options)
-            best = max(best, (again, check_model(again, database, state.job.seed)), key=_passing)
+            checks.append((again, check_model(again, database, state.job.seed)))
+            best = max(best, checks[-1], key=_passing)
     model, checked = best
     why = reasons(model, checked)
     deregister(model, checked.failed())
     outside = drop_outside_main_segment(model, checked, sequence)
-    return CheckedModel(model, why | outside, bool(outside), checked.fits)
+    excluded = why | outside
+    return CheckedModel(
+        model, excluded, bool(outside), checked.fits, [one for one in checks if not (excluded and one is best)]
+    )
 
 
-def _passing(candidate: tuple[Any, Checked]) -> int:
+def _passing(candidate: Candidate) -> int:
     return int(candidate[1].check.passed.sum())

@@ -11,7 +11,7 @@ from typing import Annotated
 from pydantic import Field
 from tyro.conf import Suppress
 
-from stages.contract import Inputs, Progress, StageConfig, StageResult, Workload
+from stages.contract import Auto, Inputs, Progress, StageConfig, StageResult, Workload
 from stages.effects.decisions import Space
 
 INPUTS = ("ingest", "normalise", "effects")
@@ -24,25 +24,37 @@ PUBLISHED = ("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ab
 
 
 class Config(StageConfig):
-    """How large a study."""
+    """The size of the study."""
 
-    seconds: float = Field(default=1800.0, gt=0, description="time for all runs and scores; --budget 30m says the same")
-    seeds: int = Field(default=3, ge=1, le=9, description="most runs of one setting; fewer where the time is short")
-    downscale: float | None = Field(
+    seconds: float = Field(
+        default=1800.0, gt=0, description="Time for all runs and scores, in seconds; --budget 30m means the same."
+    )
+    seeds: int = Field(
+        default=3, ge=1, le=9, description="Maximum number of seeds per setting; fewer if there is too little time."
+    )
+    downscale: Auto[float] = Field(
         default=None,
         ge=1,
-        description="photo width / width of the scores (default: 1, more where the longer side has over 1600 pixels)",
+        description=(
+            "Photo width divided by scored width (default: 1; more if the longer side has more than 1600 pixels)."
+        ),
     )
     # Measured or chosen by plan(); no flag is offered for them.
     speeds: Annotated[dict[str, tuple[float, float]] | None, Suppress] = Field(
-        default=None, description="steps and rays a second of training, by variant"
+        default=None, description="Steps and rays per second of training, by variant (default: measured)."
     )
-    space: Annotated[Space | None, Suppress] = Field(default=None, description="that the scene lies in")
-    sizes: Annotated[tuple[float, ...] | None, Suppress] = Field(default=None, description="photo sizes trained at")
-    tiles: Annotated[int | None, Suppress] = Field(default=None, description="tiles of the test photos to score")
+    space: Annotated[Space | None, Suppress] = Field(
+        default=None, description="Space map of the scene (default: as stage train chooses)."
+    )
+    sizes: Annotated[tuple[float, ...] | None, Suppress] = Field(
+        default=None, description="Photo sizes to train at (default: as time allows)."
+    )
+    tiles: Annotated[int | None, Suppress] = Field(
+        default=None, description="Tiles of the test photos to score (default: as time allows)."
+    )
     reading: Annotated[tuple[float, float], Suppress] = Field(
         default=(0.0, 0.0),
-        description="seconds to read the photos at one size, and the test photos at the size of the scores",
+        description="Seconds to read the photos at one size, and the test photos at the scored size.",
     )
 
 
@@ -62,6 +74,5 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """Train and score run by run, then write tables, plot, pictures and the recommendation."""
     from stages.tradeoff.study import run_study, save_study
 
-    config = config if config.speeds else plan(config, inputs, progress)
     outcome = run_study(config, inputs, folder, progress)
     return save_study(config, outcome, folder, workspace=inputs["normalise"].resolve().parents[1].name)

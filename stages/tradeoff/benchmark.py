@@ -24,7 +24,7 @@ from nerf.geometry.rays import Rays
 from nerf.geometry.scene import Scene, View
 from nerf.training.metrics import psnr
 from stages import train
-from stages.contract import Inputs, Progress, StageError
+from stages.contract import Inputs, Progress, StageError, run_stage
 from stages.effects.image_effects import photo_effects
 from stages.evaluate.image_metrics import ssim
 from stages.evaluate.tiles import TILE_SIZE, tiles_of
@@ -142,7 +142,7 @@ def train_and_score(run: Run, benchmark: Benchmark, inputs: Inputs, folder: Path
     figures: dict[str, Any] = {"failed": None}
     with peak_memory() as peak:
         try:
-            result = train.run(train.Config(**run.options), inputs, work, progress)
+            result = run_stage(train, train.Config(**run.options), inputs, work, progress)
         except StageError as error:
             if error.code not in RUN_FAILURES:
                 what = f"the study stopped at {run.label}: {error.what}"

@@ -61,6 +61,6 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """
     from stages.train import training
 
-    loaded = training.load(plan(config, inputs, progress), inputs, folder, progress)
+    loaded = training.load(config, inputs, folder, progress)
     training.compute(loaded)
     return training.save(loaded, folder, progress)

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 from tyro.conf import Suppress, arg
 
-from stages.contract import Options, StageConfig
+from stages.contract import Auto, Options, StageConfig
 from stages.effects.decisions import Space
 from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.fields.vanilla_options import VanillaOptions
@@ -26,62 +26,90 @@ PRESET_FIELDS: dict[str, FieldName] = {"paper": "vanilla"}  # the field that a p
 
 
 class Config(StageConfig):
-    """How to train. None is chosen for you, by the scene and the budget.
+    """How the field is trained. Options that are left open follow from the scene and the budget.
 
-    The options of a field ask for that field. What is written down holds those of no other one.
+    An option of a field selects that field. Only the options of the selected field are recorded.
     """
 
-    field: FieldName | None = Field(
-        default=None, description="grid: minutes without a GPU; vanilla: the published networks (default: grid)"
-    )
-    steps: int | None = Field(
-        default=None, ge=1, description="train so many steps; on a CPU with the same result every time"
-    )
-    preset: Literal["draft", "standard", "high", "paper"] | None = Field(
+    field: Auto[FieldName] = Field(
         default=None,
-        description="draft, standard, high: train for half a minute, three, fifteen, in sizes to match; "
-        "paper: the vanilla NeRF as published, for an hour (default: standard)",
+        description=(
+            "Radiance field: grid (a hash grid; minutes without a GPU) or vanilla (the original NeRF) (default: grid)."
+        ),
     )
-    seconds: float | None = Field(default=None, gt=0, description="train so long (default: from the preset)")
-    target_psnr: Annotated[float | None, arg(aliases=("--target-psnr",))] = Field(
+    steps: Auto[int] = Field(
+        default=None,
+        ge=1,
+        description=(
+            "Number of training steps; on a CPU the result is the same every time (default: train for --train.seconds)."
+        ),
+    )
+    preset: Auto[Literal["draft", "standard", "high", "paper"]] = Field(
+        default=None,
+        description=(
+            "draft, standard, high: train for 30 s, 3 min, 15 min, with sizes to match; paper: the original NeRF "
+            "for an hour (default: standard)."
+        ),
+    )
+    seconds: Auto[float] = Field(default=None, gt=0, description="Training time in seconds (default: from the preset).")
+    target_psnr: Annotated[Auto[float], arg(aliases=("--target-psnr",))] = Field(
         default=None,
         gt=0,
         le=100,
-        description="stop once so many dB are reached on validation photos, set aside from the training photos; at "
-        "the latest when the time or the steps are used up",
+        description=(
+            "Stop as soon as this PSNR in dB is reached on validation photos, which are taken from the training "
+            "photos (default: train to the end)."
+        ),
     )
-    learning_rate: float | None = Field(default=None, gt=0, description="at the start (default: from the field)")
-    seed: int = Field(default=0, description="of weights, batches and samples")
-    downscale: float | None = Field(
-        default=None, ge=1, description="photo width / trained width (default: as the budget allows)"
+    learning_rate: Auto[float] = Field(
+        default=None, gt=0, description="Initial learning rate (default: from the field)."
     )
-    background: Literal["white", "black", "random"] | None = Field(
-        default=None, description="behind photos with transparency (default: random for grid, white for vanilla)"
+    seed: int = Field(default=0, description="Seed of weights, batches and samples.")
+    downscale: Auto[float] = Field(
+        default=None, ge=1, description="Photo width divided by trained width (default: as the budget allows)."
     )
-    space: Space | None = Field(
+    background: Auto[Literal["white", "black", "random"]] = Field(
+        default=None, description="Background behind transparent pixels (default: random for grid, white for vanilla)."
+    )
+    space: Auto[Space] = Field(
         default=None,
-        description="bounded: the region of interest alone; contracted: all of space; ndc: all that cameras which face "
-        "one way can see (default: by the background and how the cameras stand)",
+        description=(
+            "Extent of the field: the region of interest (bounded), all of space (contracted), or normalised "
+            "device coordinates for cameras that face one way (ndc) (default: from the background and the "
+            "cameras)."
+        ),
     )
-    matmul: Literal["highest", "medium"] | None = Field(
+    matmul: Auto[Literal["highest", "medium"]] = Field(
         default=None,
-        description="torch's precision of matrix products (default: highest; of a run in seconds medium where that is "
-        "measured to be faster and about as exact)",
+        description=(
+            "Precision of torch's matrix multiplications (default: highest; medium for a run in seconds if it is "
+            "measured to be faster and about as exact)."
+        ),
     )
     # `--more` gives these.
-    after: Annotated[str | None, Suppress] = Field(default=None, description="go on from this finished training,")
-    more_steps: Annotated[int | None, Suppress] = Field(default=None, ge=1, description="for so many steps,")
-    more_seconds: Annotated[float | None, Suppress] = Field(default=None, gt=0, description="or for so long")
+    after: Annotated[str | None, Suppress] = Field(
+        default=None, description="The finished training to continue (default: a new training)."
+    )
+    more_steps: Annotated[int | None, Suppress] = Field(
+        default=None, ge=1, description="Steps to add to it (default: none)."
+    )
+    more_seconds: Annotated[float | None, Suppress] = Field(
+        default=None, gt=0, description="Seconds to add to it (default: none)."
+    )
     # Stage effects decides it; no flag is offered.
-    view_dependence: Annotated[bool | None, Suppress] = Field(default=None, description="colour knows the direction")
+    view_dependence: Annotated[bool | None, Suppress] = Field(
+        default=None, description="Colour depends on the viewing direction (default: as stage effects decides)."
+    )
 
     grid: HashGridOptions = HashGridOptions()
     vanilla: VanillaOptions = VanillaOptions()
 
-    checkpoint_seconds: float | None = Field(
-        default=None, gt=0, description="between checkpoints (default: a twentieth of the seconds, 30 at most)"
+    checkpoint_seconds: Auto[float] = Field(
+        default=None,
+        gt=0,
+        description="Seconds between checkpoints (default: a twentieth of the training time, at most 30).",
     )
-    tensorboard: bool = Field(default=False, description="write the curve for TensorBoard, too")
+    tensorboard: bool = Field(default=False, description="Also write the learning curve for TensorBoard.")
 
     @model_validator(mode="after")
     def _one_budget(self) -> "Config":

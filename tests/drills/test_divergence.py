@@ -17,7 +17,7 @@ from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.vanilla_trainer import VanillaTrainer
 from stages import train
-from stages.contract import StageError, StageResult
+from stages.contract import StageError, StageResult, run_stage
 from stages.effects.decisions import read_decisions, write_decisions
 from stages.ingest.decoding import DecodeError, decode
 from stages.io.field_files import load_field
@@ -61,7 +61,7 @@ def inputs(tmp_path: Path) -> dict[str, Path]:
 def trained(kind: str, inputs: dict[str, Path], folder: Path, progress: Any, **settings: Any) -> StageResult:
     folder.mkdir(exist_ok=True)
     config: dict[str, Any] = {"downscale": 1.0} | KINDS[kind] | settings
-    return train.run(train.Config(**config), inputs, folder, progress)
+    return run_stage(train, train.Config(**config), inputs, folder, progress)
 
 
 def seen(folder: Path, inputs: dict[str, Path], progress: Any) -> tuple[float, float]:

@@ -2,6 +2,8 @@
 
 import json
 import math
+from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,8 @@ import pytest
 import trimesh
 
 from pipeline.cli.commands import run_command
+from pipeline.engine.stage_list import STAGES
+from stages.contract import StageConfig, declared
 from tests.small_scenes import write_blender_scene
 from tests.video_files import read_video
 
@@ -21,12 +25,33 @@ SMALL = "--train.steps 150 --train.downscale 1 --render.frames 4 --render.width 
 
 
 @pytest.fixture(scope="module")
-def output(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def planned() -> Iterator[Counter[str]]:
+    """How often each stage was planned."""
+    calls = Counter[str]()
+
+    def counted(name: str, plan: Callable[..., StageConfig]) -> Callable[..., StageConfig]:
+        return lambda *given: calls.update([name]) or plan(*given)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name, stage in STAGES.items():
+            if plan := declared(stage, "plan"):
+                patch.setattr(stage, "plan", counted(name, plan))
+        yield calls
+
+
+@pytest.fixture(scope="module")
+def output(planned: Counter[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output folder of a run on a small set with known cameras."""
     folder = tmp_path_factory.mktemp("chain")
     photos = write_blender_scene(folder / "photos", train=14, test=3)
     assert run_command(["run", str(photos), "-o", str(folder / "w.nerf"), *SMALL]) == 0
     return folder / "w.nerf/output"
+
+
+def test_every_stage_is_planned_once(output: Path, planned: Counter[str]):
+    assert planned == dict.fromkeys(["sfm", "effects", "train", "evaluate", "render", "mesh"], 1)
+    assert run_command(["resume", str(output.parent)]) == 0
+    assert set(planned.values()) == {1}
 
 
 def numbers_in(value: Any) -> list[float]:

@@ -8,7 +8,7 @@ import pytest
 
 from nerf.geometry.alignment import align
 from stages import ingest, sfm
-from stages.contract import StageError
+from stages.contract import StageError, run_stage
 from stages.io.files import read_json
 from stages.sfm.colmap.models import read_model
 from tests.hard_photos import (
@@ -54,7 +54,7 @@ def found(
     inputs = {"ingest": folder / "ingest"}
     inputs["ingest"].mkdir()
     ingest.run(ingest.Config(photos=folder / "photos"), {}, inputs["ingest"], Listening())
-    sfm.run(config or sfm.Config(), inputs, folder / "sfm", Listening())
+    run_stage(sfm, config or sfm.Config(), inputs, folder / "sfm", Listening())
     return folder / "sfm", notes
 
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from nerf.geometry.normalisation import normalise
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from nerf.synthetic.scenes import ring_of_cameras
+from pipeline.engine.display import SilentDisplay
 from stages.contract import StageError
 from stages.ingest.sources import find_source
 from stages.io.photos import Photo, write_photos
@@ -24,7 +25,6 @@ from stages.sfm.colmap.models import read_model, write_model
 from stages.sfm.imported.conventions import AS_DECLARED
 from stages.sfm.imported.import_poses import write_imported_model
 from tests.fuzz.inputs import H, W, json_files
-from tests.synthetic_photos import Quiet
 
 
 @cache
@@ -63,7 +63,7 @@ def _load_cameras(given: Path, folder: Path) -> None:
 
 def _import_cameras(cameras: Path, photos: list, folder: Path) -> None:
     """The end of stage sfm with given cameras, and the scene frame of them: finite, whatever they were."""
-    write_imported_model(cameras, AS_DECLARED, photos, folder, folder / "sfm", Quiet())
+    write_imported_model(cameras, AS_DECLARED, photos, folder, folder / "sfm", SilentDisplay())
     model = read_model(folder / "sfm" / "sparse")
     try:
         found = normalise(_reconstruction(model, list(range(len(model.images))), None), None)

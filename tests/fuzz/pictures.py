@@ -10,6 +10,7 @@ import numpy as np
 from hypothesis import strategies as st
 from PIL import Image
 
+from pipeline.engine.display import SilentDisplay
 from stages.ingest.decoding import decode
 from stages.ingest.masks import read_mask
 from stages.ingest.near_duplicates import thumbnail
@@ -17,7 +18,6 @@ from stages.ingest.sharpness import one_colour, sharpness
 from stages.ingest.video_frames import take_frames
 from stages.io.video import video_writer
 from tests.fuzz.inputs import H, W, damaged
-from tests.synthetic_photos import Quiet
 
 
 @cache
@@ -98,4 +98,4 @@ def clip() -> bytes:
 
 def try_video(folder: Path) -> None:
     (folder / "out").mkdir()
-    assert len(take_frames(folder / "a.mp4", 5, folder / "out", Quiet())) >= 3
+    assert len(take_frames(folder / "a.mp4", 5, folder / "out", SilentDisplay())) >= 3

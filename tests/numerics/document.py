@@ -4,13 +4,14 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from pipeline.doctor.numerics.matrix import Row, figure, limit
+from tests.numerics.descriptions import DESCRIPTIONS
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "NUMERICS.md"
 
 # What has no row. A module of nerf/ stands in a row, here, or fails a test.
 ELSEWHERE = {
     "nerf/kernels/__init__.py": "resolutions rounded, rows in whole numbers: tests/nerf/kernels/torch/test_encoding.py",
-    "nerf/kernels/torch/gather.py": "rows are copied: tests/nerf/kernels/warp/test_lanes.py",
+    "nerf/kernels/torch/gather.py": "rows are copied: tests/nerf/kernels/warp/test_gpu_kernels.py",
     "nerf/kernels/torch/hidden_layer.py": "max(x + y, 0) and its mask, bit for bit: "
     "tests/nerf/kernels/warp/test_warp.py; "
     "NaN stays NaN: tests/numerics/test_not_a_number.py",
@@ -124,8 +125,8 @@ def document(rows: Iterable[Row]) -> str:
 
 def _cells(row: Row) -> list[str]:
     case, backends = row.case, row.measured.values()
-    tried = f"{case.tried} ({next(iter(backends)).rows})"
-    words = case.formula, f"`{case.where}`", case.domain, case.hazard, case.answer, tried
+    domain, hazard, answer, tried = DESCRIPTIONS[case.formula]
+    words = case.formula, f"`{case.where}`", domain, hazard, answer, f"{tried} ({next(iter(backends)).rows})"
     values = " / ".join(figure(measured.value) for measured in backends)
     gradients = " / ".join(figure(measured.gradient) for measured in backends)
     return [

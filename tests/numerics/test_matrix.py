@@ -25,7 +25,7 @@ FIGURE = re.compile(r"(?<![\w.])(?:\d(?:e[+-]?\d+)|0|—|inf)(?= /| \(≤)")
 
 
 @functools.cache
-def capture_sequence(case: Case) -> Row:
+def row_of(case: Case) -> Row:
     """A case measured on the CPU."""
     return Row(case, {name: measure(case, BACKENDS[name], "cpu") for name in backends_of(case)})
 
@@ -40,7 +40,7 @@ def named(case: Case) -> str:
 
 @pytest.mark.parametrize("case", CASES, ids=named)
 def test_errors_keep_their_bounds_and_the_bounds_mean_something(case: Case) -> None:
-    row = capture_sequence(case)
+    row = row_of(case)
     measured = row.measured.values()
     assert row.passed, measured
     assert max(each.value for each in measured) >= case.value.error / SLACK
@@ -115,7 +115,7 @@ def test_the_reasons_name_tests_that_exist() -> None:
 def test_the_document_is_what_would_be_written() -> None:
     """But for the figures measured, which depend on the machine: those written must keep the limits beside them."""
     written = DOCUMENT.read_text("utf-8")
-    found, wanted = FIGURE.sub("#", written), FIGURE.sub("#", document(map(capture_sequence, CASES)))
+    found, wanted = FIGURE.sub("#", written), FIGURE.sub("#", document(map(row_of, CASES)))
     assert found == wanted, "run python -m tests.numerics"
     lines = [line for line in written.splitlines() if line.startswith("| ")][1:]
     for case, line in zip(CASES, lines, strict=True):

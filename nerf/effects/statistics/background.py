@@ -4,22 +4,22 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nerf import REGION_HALF_SIZE
-from nerf.effects.statistics.statistic import Evidence, unknown
+from nerf.effects.statistics.statistic import Statistic, unknown
 
 NEVER = float("inf")  # the threshold of what no share decides, and its noise: only alpha does
 CELLS = 16  # along each side of a photo
 
 
-def background_evidence(
+def background_statistic(
     position: Float[np.ndarray, "points 3"], point: Int[np.ndarray, "k"], has_alpha: bool, untracked: float
-) -> Evidence:
+) -> Statistic:
     """Photos with alpha say themselves what is there; without it the background is always called for, since sky and
     plain walls have no points: that none lies beyond the region proves nothing.
 
     The share of observations whose point does, and ``untracked``, are shown and decide nothing, so threshold and noise
     are infinite."""
     if has_alpha:
-        return Evidence(0.0, "share", NEVER, NEVER, False, "the photos' alpha says what is background")
+        return Statistic(0.0, "share", NEVER, NEVER, False, "the photos' alpha says what is background")
     seen = np.bincount(point, minlength=len(position)).astype(float)
     if not seen.any():
         return unknown("share", NEVER, "no tracks", True)
@@ -29,7 +29,7 @@ def background_evidence(
         f"only alpha could tell that nothing lies beyond the region: {share:.1%} of what is tracked does, and "
         f"{untracked:.0%} of the photos' area has no track near"
     )
-    return Evidence(share, "share", NEVER, NEVER, True, words)
+    return Statistic(share, "share", NEVER, NEVER, True, words)
 
 
 def untracked_share(place: Float[np.ndarray, "k 2"], view: Int[np.ndarray, "k"], views: int) -> float:

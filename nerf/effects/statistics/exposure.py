@@ -17,7 +17,7 @@ from nerf.effects.statistics.statistic import (
     MIN_SIGNAL_TO_NOISE,
     OF_GAUSSIAN,
     VALUE_PER_LOG_LIGHT,
-    Evidence,
+    Statistic,
     classify,
     unknown,
 )
@@ -76,7 +76,7 @@ def fit_exposure(tracks: TrackColours) -> ExposureFit:
     gain, error = np.zeros((tracks.views, 3)), np.full((tracks.views, 3), np.inf)
     rest, weight = np.zeros_like(y), np.ones_like(y)
     vignetting, noise = np.zeros(3), np.zeros(3)
-    for channel in range(3 if layout.main.any() else 0):
+    for channel in range(3 if layout.connected.any() else 0):
         part = y[:, channel]
         weight[:, channel], noise[channel], given_up = _robust_weights(layout, part, sigma[:, channel])
         slope, slope_error = layout.slope(part, square, weight[:, channel])
@@ -84,9 +84,9 @@ def fit_exposure(tracks: TrackColours) -> ExposureFit:
             vignetting[channel] = slope
             part = part - slope * square
             weight[:, channel], noise[channel], given_up = _robust_weights(layout, part, sigma[:, channel])
-        gain[:, channel] = layout.parts(part, weight[:, channel])
-        rest[:, channel] = layout.around_points(part - gain[layout.view, channel], weight[:, channel])
-        error[:, channel] = layout.errors(rest[:, channel], weight[:, channel]) * given_up
+        gain[:, channel] = layout.view_effects(part, weight[:, channel])
+        rest[:, channel] = layout.within_points(part - gain[layout.view, channel], weight[:, channel])
+        error[:, channel] = layout.standard_errors(rest[:, channel], weight[:, channel]) * given_up
     known = np.asarray(np.isfinite(error).all(axis=1))
     if known.any():
         gain = np.where(known[:, None], gain - np.median(gain[known], axis=0), 0.0)
@@ -108,9 +108,9 @@ def _robust_weights(
     base = sigma**-2
     weight, scale, size, before = base, 0.0, np.zeros_like(y), np.zeros(layout.views)
     for turn in range(MAX_ROUNDS):
-        gain = layout.parts(y, weight)
-        rest = layout.around_points(y - gain[layout.view], weight)
-        size = np.abs(rest) / (sigma * np.sqrt(np.maximum(1 - layout.share(weight), 0.02)))
+        gain = layout.view_effects(y, weight)
+        rest = layout.within_points(y - gain[layout.view], weight)
+        size = np.abs(rest) / (sigma * np.sqrt(np.maximum(1 - layout.point_share(weight), 0.02)))
         scale = max(OF_GAUSSIAN * float(np.median(size)), MIN_NOISE)
         size = size / scale
         if turn < HUBER_ROUNDS:
@@ -135,33 +135,33 @@ def _contrast(
     laid against middle (Bland & Altman 1986).
     """
     none = np.zeros(layout.views)
-    if not layout.main.any():
+    if not layout.connected.any():
         return none, np.full(layout.views, np.inf), 0.0
     grey, importance = y.mean(axis=1), weight.min(axis=1)
-    share = np.minimum(layout.share(importance), 0.98)
-    difference = (grey - layout.mean(grey, importance)) / (1 - share)
+    share = np.minimum(layout.point_share(importance), 0.98)
+    difference = (grey - layout.point_mean(grey, importance)) / (1 - share)
     importance = importance * (1 - share)
-    total = np.maximum(layout.per_view(importance), np.finfo(float).tiny)
+    total = np.maximum(layout.sum_per_view(importance), np.finfo(float).tiny)
     middle = grey - difference / 2
-    middle = middle - (layout.per_view(importance * middle) / total)[layout.view]
-    difference = difference - (layout.per_view(importance * difference) / total)[layout.view]
-    size = layout.per_view(importance * middle**2)
-    known = layout.main & (size > 1e-4 * total) & (np.bincount(layout.view, minlength=layout.views) > 3)
+    middle = middle - (layout.sum_per_view(importance * middle) / total)[layout.view]
+    difference = difference - (layout.sum_per_view(importance * difference) / total)[layout.view]
+    size = layout.sum_per_view(importance * middle**2)
+    known = layout.connected & (size > 1e-4 * total) & (np.bincount(layout.view, minlength=layout.views) > 3)
     if not known.any():
         return none, np.full(layout.views, np.inf), 0.0
     size = np.where(known, size, 1.0)
-    slope = np.where(known, layout.per_view(importance * middle * difference) / size, 0.0)
+    slope = np.where(known, layout.sum_per_view(importance * middle * difference) / size, 0.0)
     score = importance * middle * (difference - slope[layout.view] * middle)
-    error = np.where(known, np.sqrt(layout.per_view(score**2)) / size, np.inf)
+    error = np.where(known, np.sqrt(layout.sum_per_view(score**2)) / size, np.inf)
     slope = np.where(known, slope - np.median(slope[known]), 0.0)
     return slope, error, float(np.sqrt(np.median((size / total)[known])))
 
 
-def exposure_evidence(
+def exposure_statistic(
     fit: ExposureFit,
     told: Float[np.ndarray, "views"] | None = None,
     odd: Bool[np.ndarray, "views"] | None = None,
-) -> Evidence:
+) -> Statistic:
     """Whether photos differ in exposure (or white balance): the deviation of gains over photos and channels, EV.
 
     The noise, that of one usual gain, is beside it; what all gains have is taken off in quadrature, so that noise alone

@@ -68,7 +68,7 @@ def _usual_light(tracks: TrackColours, fit: ExposureFit) -> Float[np.ndarray, "p
     mean = np.full((size, 3), np.nan)
     for channel in range(3):
         light = linear_light(tracks.colour[fit.used, channel]) * np.exp(-fit.log_gain[fit.layout.view, channel])
-        mean[tracks.point[fit.used], channel] = fit.layout.mean(light, fit.weight[:, channel])
+        mean[tracks.point[fit.used], channel] = fit.layout.point_mean(light, fit.weight[:, channel])
     return mean
 
 

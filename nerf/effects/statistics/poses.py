@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from nerf.effects.statistics.statistic import GREY_ZONE, HUBER, OF_GAUSSIAN, Evidence, decide, unknown
+from nerf.effects.statistics.statistic import GREY_ZONE, HUBER, OF_GAUSSIAN, Statistic, decide, unknown
 
 PX = "px at 1000"  # pixels of a photo whose longer side has 1000: what a full photo's are depends on the camera
 # An error of d pixels changes values by d times their step from pixel to pixel, which in usual photos at 1000 pixels is
@@ -61,9 +61,9 @@ def _similarity(
     return (design @ solution).reshape(2, -1).T, variance
 
 
-def pose_evidence(
+def pose_statistic(
     power: Float[np.ndarray, "views"], expected: Float[np.ndarray, "views"], uncertainty_px: Float[np.ndarray, "views"]
-) -> Evidence:
+) -> Statistic:
     """By how much a quarter of the photos (OFF) or more are off: the common residual, noise taken off; or how uncertain
     their poses are said to be, where that is more. All in PX; NaN where a photo's is not known.
 
@@ -86,4 +86,4 @@ def pose_evidence(
         called_for = None
     off = f"a quarter of the photos are off by {common:.2g} px or more as a whole, ± {noise:.1g}"
     words = f"at 1000 pixels {off}; poses uncertain by {uncertain:.2g} px"
-    return Evidence(max(common, uncertain), PX, THRESHOLD_PX, noise, called_for, words)
+    return Statistic(max(common, uncertain), PX, THRESHOLD_PX, noise, called_for, words)

@@ -18,12 +18,12 @@ HUBER = 1.345  # deviations, beyond which what is left pulls no harder: 95 % of 
 OF_GAUSSIAN = 1.4826  # the deviation of Gaussian noise by its median absolute value
 
 
-class Evidence(NamedTuple):
-    """What was measured. ``threshold``: from here on the effect is called for; the grey zone begins at half of it.
-    ``noise`` is of the statistic, both in ``unit``, infinite where nothing is known. ``called_for`` None: a pilot
-    should decide, where there is one. ``words``: one clause with its number."""
+class Statistic(NamedTuple):
+    """The ``value`` that was measured and its ``noise``, infinite where nothing is known, both in ``unit``. From the
+    ``threshold`` on the effect is called for; the grey zone begins at half of it. ``called_for`` None: a pilot should
+    decide, where there is one. ``words``: one clause with its number."""
 
-    statistic: float
+    value: float
     unit: str
     threshold: float
     noise: float
@@ -39,11 +39,11 @@ def decide(statistic: float, noise: float, threshold: float) -> bool | None:
     return False if statistic + 2 * noise < threshold / GREY_ZONE else None
 
 
-def classify(statistic: float, noise: float, threshold: float, unit: str, words: str) -> Evidence:
-    """An Evidence that follows the rule of :func:`decide`."""
-    return Evidence(statistic, unit, threshold, noise, decide(statistic, noise, threshold), words)
+def classify(statistic: float, noise: float, threshold: float, unit: str, words: str) -> Statistic:
+    """A Statistic that follows the rule of :func:`decide`."""
+    return Statistic(statistic, unit, threshold, noise, decide(statistic, noise, threshold), words)
 
 
-def unknown(unit: str, threshold: float, why: str, called_for: bool | None) -> Evidence:
+def unknown(unit: str, threshold: float, why: str, called_for: bool | None) -> Statistic:
     """Nothing can be measured; ``called_for`` is what to do without knowing."""
-    return Evidence(0.0, unit, threshold, float("inf"), called_for, f"{why}: nothing known")
+    return Statistic(0.0, unit, threshold, float("inf"), called_for, f"{why}: nothing known")

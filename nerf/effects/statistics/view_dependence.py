@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from nerf.effects.statistics.additive_model import AdditiveModel
 from nerf.effects.statistics.exposure import ExposureFit
-from nerf.effects.statistics.statistic import MIN_EFFECT, Evidence, classify, unknown
+from nerf.effects.statistics.statistic import MIN_EFFECT, Statistic, classify, unknown
 from nerf.effects.statistics.tracks import TrackColours, log_light
 from nerf.rendering.srgb import OFFSET, POWER
 
@@ -23,7 +23,7 @@ LARGEST = 20.0  # medians of squared differences (three deviations), what false 
 BATCHES = 20
 
 
-def view_dependence_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence:
+def view_dependence_statistic(tracks: TrackColours, fit: ExposureFit) -> Statistic:
     """The deviation of colours along tracks (sRGB values, root mean square of the channels) that wide angles have over
     narrow ones; the widest third of the pairs against the narrowest. Noise by batches of points (jackknife).
 
@@ -57,7 +57,7 @@ def view_dependence_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence
     return _classify(growth, noise, float(np.median(angle[wide])))
 
 
-def _classify(growth: float, noise: float, angle_deg: float) -> Evidence:
+def _classify(growth: float, noise: float, angle_deg: float) -> Statistic:
     """Variances as deviations; two noises more in the one are two more in the other."""
     deviation = float(np.sqrt(max(growth, 0.0)))
     uncertain = (float(np.sqrt(deviation**2 + 2 * noise)) - deviation) / 2

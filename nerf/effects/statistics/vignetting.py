@@ -3,7 +3,7 @@
 import numpy as np
 
 from nerf.effects.statistics.exposure import EV, ExposureFit
-from nerf.effects.statistics.statistic import MIN_EFFECT, VALUE_PER_LOG_LIGHT, Evidence, classify, unknown
+from nerf.effects.statistics.statistic import MIN_EFFECT, VALUE_PER_LOG_LIGHT, Statistic, classify, unknown
 from nerf.effects.statistics.tracks import TrackColours, log_light
 
 # Light at radius r (half diagonals) is exp(a r^2). Over the pixels of a photo r^2 deviates by some 0.24 from its mean,
@@ -13,7 +13,7 @@ from nerf.effects.statistics.tracks import TrackColours, log_light
 THRESHOLD_EV = 2 * MIN_EFFECT / (0.24 * VALUE_PER_LOG_LIGHT) / EV
 
 
-def vignetting_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence:
+def vignetting_statistic(tracks: TrackColours, fit: ExposureFit) -> Statistic:
     """The gain at the corners beside the middle, EV, mean of the channels: the slope of ln(light) over the square of
     the radius within photos and points alike, so neither gains nor points that are always in corners pass for it."""
     if not fit.known.any():

@@ -8,7 +8,7 @@ from nerf.effects.statistics.additive_model import additive_model
 from nerf.effects.statistics.exposure import EV, THRESHOLD_EV, ExposureFit, or_all
 from nerf.effects.statistics.outlier_images import OutlierImages
 from nerf.effects.statistics.poses import PX, THRESHOLD_PX
-from nerf.effects.statistics.statistic import OF_GAUSSIAN, Evidence, classify, unknown
+from nerf.effects.statistics.statistic import OF_GAUSSIAN, Statistic, classify, unknown
 from nerf.effects.statistics.tracks import MAX_IN_TRACK, TrackColours, within_groups
 from nerf.rendering.srgb import linear_light
 
@@ -35,7 +35,7 @@ MIN_TRANSIENT_SHARE = 0.01
 MIN_MOTION_PX = 2.0  # per frame, at 1000 pixels, below which rows have no time to differ
 
 
-def tone_evidence(fit: ExposureFit) -> Evidence:
+def tone_statistic(fit: ExposureFit) -> Statistic:
     """Whether gains alone are not enough: how much photos' gains differ between bright points and dark ones, EV per
     deviation of brightness. The threshold is that of exposure."""
     known = fit.known & np.isfinite(fit.contrast_error)
@@ -50,7 +50,7 @@ def tone_evidence(fit: ExposureFit) -> Evidence:
     return classify(spread, noise, THRESHOLD_EV, "EV", words)
 
 
-def transients_evidence(outliers: OutlierImages, fit: ExposureFit) -> Evidence:
+def transients_statistic(outliers: OutlierImages, fit: ExposureFit) -> Statistic:
     """The share of all points that photos show in another colour beyond what is usual for a photo, of those photos only
     where it is much more than in the others."""
     if not fit.known.any():
@@ -68,7 +68,7 @@ def transients_evidence(outliers: OutlierImages, fit: ExposureFit) -> Evidence:
     return classify(found, noise, MIN_TRANSIENT_SHARE, "share", words)
 
 
-def scale_variation_evidence(tracks: TrackColours) -> Evidence:
+def scale_variation_statistic(tracks: TrackColours) -> Statistic:
     """The 95th percentile over points of the largest by the smallest footprint, over the photos that see each; or the
     ratio of the 95th by the 5th percentile of photos, where that is more.
 
@@ -97,13 +97,13 @@ def _size_ratio_of_photos(tracks: TrackColours) -> float:
     rank, length = within_groups(seen.point)
     seen = seen.only((length > 1) & (rank < MAX_IN_TRACK))
     layout = additive_model(seen.view, seen.point, seen.views)
-    if not layout.main.any():
+    if not layout.connected.any():
         return 1.0
-    size = layout.parts(np.log(seen.footprint), np.ones(len(seen)))[layout.main]
+    size = layout.view_effects(np.log(seen.footprint), np.ones(len(seen)))[layout.connected]
     return float(np.exp(np.ptp(np.quantile(size, [1 - SIZE_QUANTILE, SIZE_QUANTILE]))))
 
 
-def participating_media_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence:
+def participating_media_statistic(tracks: TrackColours, fit: ExposureFit) -> Statistic:
     """The exponent of fading over the range of distances at which points are seen (nine tenths of it): the slope of the
     logarithm of saturation over distance within photos and points alike. Where nothing is known, that is no reason
     to expect fog."""
@@ -116,7 +116,7 @@ def participating_media_evidence(tracks: TrackColours, fit: ExposureFit) -> Evid
     strong = (np.bincount(point, strong) == np.bincount(point))[point]
     part = fit.used[strong]
     layout = additive_model(tracks.view[part], tracks.point[part], tracks.views)
-    if not layout.main.any():
+    if not layout.connected.any():
         return unknown("", MIN_FADING, "no colourful points", False)
     light, distance, weight = (
         linear_light(tracks.colour[part]),
@@ -126,7 +126,7 @@ def participating_media_evidence(tracks: TrackColours, fit: ExposureFit) -> Evid
     slope, error = layout.slope(np.log(np.ptp(light, axis=1) / light.mean(axis=1)), distance, weight)
     if not np.isfinite(error):
         return unknown("", MIN_FADING, "every point is seen from one distance", False)
-    reach = float(np.ptp(np.quantile(layout.around_points(distance, weight), [0.05, 0.95])))
+    reach = float(np.ptp(np.quantile(layout.within_points(distance, weight), [0.05, 0.95])))
     fading = max(-slope * reach, 0.0)
     words = f"colours fade by {1 - np.exp(-fading):.0%} from near to far photos, ± {error * reach:.0%}"
     found = classify(fading, error * reach, MIN_FADING, "", words)
@@ -139,12 +139,12 @@ def _evenness_weights(tracks: TrackColours) -> Float[np.ndarray, "k"]:
     return np.ptp(tracks.colour, axis=1) ** 2 / (1 + rough**2)
 
 
-def rolling_shutter_evidence(
+def rolling_shutter_statistic(
     residual: Float[np.ndarray, "k 2"],
     row: Float[np.ndarray, "k"],
     motion: Float[np.ndarray, "views 2"],
     view: Int[np.ndarray, "k"],
-) -> Evidence:
+) -> Statistic:
     """The error at the upper and lower edges of a frame of usual motion, PX: half the product of the motion and of the
     readout as a part of the time between frames. Called for where it harms as wrong poses do
     (nerf/effects/statistics/poses.py).

@@ -17,18 +17,18 @@ def select_colour_samples(
     samples: Samples,
     sigma: Float[Tensor, "samples"],
     opacity_step: float,
-    depth: Float64[Tensor, "rays"],
+    optical_depth: Float64[Tensor, "rays"],
     accumulated: Float[Tensor, "rays"],
 ) -> ColourSamples:
     """Of one marching round, the samples at which floor(O / opacity_step + 1/2) grows, where O = 1 - exp(-sum sigma dt)
     is the opacity of the ray so far. Samples whose density is NaN are left out.
 
-    In place, ``depth`` grows by the optical depth of all of the round's samples, and ``accumulated`` becomes O at the
-    last selected sample, of this round or an earlier one.
+    In place, ``optical_depth`` grows by that of all of the round's samples, and ``accumulated`` becomes O at the last
+    selected sample, of this round or an earlier one.
     """
     tau = (sigma * samples.dt).clamp(max=OPAQUE).double()
-    before = depth.index_select(0, samples.ray) + sums_before(samples, tau)
-    depth.index_add_(0, samples.ray, tau)
+    before = optical_depth.index_select(0, samples.ray) + sums_before(samples, tau)
+    optical_depth.index_add_(0, samples.ray, tau)
     opacity = _opacity(before + tau)
     index = (_opacity_steps(opacity, opacity_step) > _opacity_steps(_opacity(before), opacity_step)).nonzero()[:, 0]
     starts = torch.searchsorted(index, samples.starts.long(), out_int32=True)
@@ -41,8 +41,8 @@ def select_colour_samples(
     return ColourSamples(Samples(starts, ray, t, dt), index.int(), (opacity - previous).to(sigma.dtype))
 
 
-def _opacity(depth: Float64[Tensor, "samples"]) -> Float64[Tensor, "samples"]:
-    return -torch.expm1(-depth)
+def _opacity(optical_depth: Float64[Tensor, "samples"]) -> Float64[Tensor, "samples"]:
+    return -torch.expm1(-optical_depth)
 
 
 def _opacity_steps(opacity: Float64[Tensor, "samples"], opacity_step: float) -> Float64[Tensor, "samples"]:

@@ -1,4 +1,4 @@
-"""Between two rounds of ray marching (nerf/rendering/early_termination.py): which rays go on, and from where."""
+"""Between two rounds of ray marching (nerf/rendering/early_termination.py): which rays continue, and from where."""
 
 from collections.abc import Sequence
 
@@ -18,22 +18,24 @@ def finish_round(
     threshold: float,
     jitter: Float[Tensor, "rays"],
     far: Float[Tensor, "rays"],
-    depth: Float64[Tensor, "rays"],
+    optical_depth: Float64[Tensor, "rays"],
     near: Float[Tensor, "rays"],
 ) -> None:
-    """In place, after a round of up to ``stepping.max_samples`` samples of each ray: ``depth`` grows by their optical
-    depth, sum sigma dt, and ``near`` becomes where the ray goes on.
+    """In place, after a round of up to ``stepping.max_samples`` samples of each ray: ``optical_depth`` grows by theirs,
+    sum sigma dt, and ``near`` becomes where the ray continues.
 
     That is where the interval behind its last sample's begins; ``far``, so that nothing is left of it, for a ray that
-    had fewer samples than it might have had, or whose transmittance exp(-depth) is below ``threshold`` or no number.
+    had fewer samples than it might have had, or whose transmittance exp(-optical_depth) is below ``threshold`` or NaN.
     """
-    depth.index_add_(0, samples.ray, (sigma * samples.dt).clamp(max=OPAQUE).double())
-    goes_on = (samples.starts.diff() == stepping.max_samples) & (torch.exp(-depth.to(sigma.dtype)) >= threshold)
-    ray = goes_on.nonzero()[:, 0]
+    optical_depth.index_add_(0, samples.ray, (sigma * samples.dt).clamp(max=OPAQUE).double())
+    continues = (samples.starts.diff() == stepping.max_samples) & (
+        torch.exp(-optical_depth.to(sigma.dtype)) >= threshold
+    )
+    ray = continues.nonzero()[:, 0]
     last = samples.t.index_select(0, samples.starts.index_select(0, ray + 1) - 1)
-    onward = s_to_t(stepping, t_to_s(stepping, last) + (1 - jitter.index_select(0, ray)))
+    next_near = s_to_t(stepping, t_to_s(stepping, last) + (1 - jitter.index_select(0, ray)))
     near.copy_(far)
-    near[ray] = torch.minimum(onward, far[ray])
+    near[ray] = torch.minimum(next_near, far[ray])
 
 
 def pack_rounds(rounds: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]:

@@ -21,8 +21,8 @@ def encode(
     features = []
     for level in range(len(layout.resolutions)):
         cell, inside = _cell(layout.resolutions[level], points)
-        rows, shares = (part.T.contiguous() for part in (_corner_rows(layout, level, cell), _corner_shares(inside)))
-        features.append(torch.nn.functional.embedding_bag(rows, table, per_sample_weights=shares, mode="sum"))
+        rows, weights = (part.T.contiguous() for part in (_corner_rows(layout, level, cell), _corner_weights(inside)))
+        features.append(torch.nn.functional.embedding_bag(rows, table, per_sample_weights=weights, mode="sum"))
     return torch.cat(features, -1)
 
 
@@ -33,17 +33,17 @@ def encode_backward_table(
     grad_features: Float[Tensor, "points width"],
     grad_table: Float[Tensor, "rows features"],
 ) -> None:
-    """Add to the rows of some levels in ``grad_table``, in place: every vertex gets the gradient of each point that it
-    served, times its share. Levels share no rows: several threads may each do some."""
+    """Add to the rows of some levels in ``grad_table``, in place: every vertex gets the gradient of each point around
+    it, times its weight. Levels have no rows in common: several threads may each do some."""
     flat = grad_table.view(-1)
     for level in levels:
         first_column = level * layout.features
         columns = grad_features[:, first_column : first_column + layout.features].T.contiguous()
         cell, inside = _cell(layout.resolutions[level], points)
         first_entry = _corner_rows(layout, level, cell).flatten().long() * layout.features
-        shares = _corner_shares(inside)
+        weights = _corner_weights(inside)
         for feature, column in enumerate(columns):
-            flat.scatter_add_(0, first_entry + feature, (shares * column).flatten())
+            flat.scatter_add_(0, first_entry + feature, (weights * column).flatten())
 
 
 def encode_backward_points(
@@ -59,7 +59,7 @@ def encode_backward_points(
         cell, inside = _cell(resolution, points)
         rows = _corner_rows(layout, level, cell)
         corners = table.index_select(0, rows.flatten()).view(8, *grad.shape)
-        grad_points += resolution * _corner_shares_backward(inside, (corners * grad).sum(-1))
+        grad_points += resolution * _corner_weights_backward(inside, (corners * grad).sum(-1))
     return grad_points
 
 
@@ -86,19 +86,19 @@ def _corner_rows(layout: GridLayout, level: int, cell: Int32[Tensor, "3 points"]
     return (layout.level_offsets[level] + number).flatten(0, 2)
 
 
-def _corner_shares(inside: Float[Tensor, "3 points"]) -> Float[Tensor, "8 points"]:
+def _corner_weights(inside: Float[Tensor, "3 points"]) -> Float[Tensor, "8 points"]:
     """Trilinear weights of the corners: the product over axes of u at the far face and 1 - u at the near one."""
     x, y, z = (torch.stack([1 - u, u]) for u in inside)
     return ((x[:, None] * y)[:, :, None] * z).flatten(0, 2)
 
 
-def _corner_shares_backward(
+def _corner_weights_backward(
     inside: Float[Tensor, "3 points"], grad: Float[Tensor, "8 points"]
 ) -> Float[Tensor, "points 3"]:
     """Along an axis: the far face less the near one of the values interpolated on them."""
     x, y, z = (torch.stack([1 - u, u]) for u in inside)
     grad = grad.view(2, 2, 2, -1)
-    on_x = torch.einsum("ijkn,jn,kn->in", grad, y, z)
-    on_y = torch.einsum("ijkn,in,kn->jn", grad, x, z)
-    on_z = torch.einsum("ijkn,in,jn->kn", grad, x, y)
-    return torch.stack([face[1] - face[0] for face in (on_x, on_y, on_z)], -1)
+    grad_x = torch.einsum("ijkn,jn,kn->in", grad, y, z)
+    grad_y = torch.einsum("ijkn,in,kn->jn", grad, x, z)
+    grad_z = torch.einsum("ijkn,in,jn->kn", grad, x, y)
+    return torch.stack([face[1] - face[0] for face in (grad_x, grad_y, grad_z)], -1)

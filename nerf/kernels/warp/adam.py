@@ -26,22 +26,22 @@ def adam(
 ) -> None:
     """As in nerf.kernels.torch.adam."""
     bias_correction1, bias_correction2 = 1 - BETA1**step, 1 - BETA2**step
-    scales, tensors = (
+    factors, tensors = (
         (learning_rate / bias_correction1, 1 / bias_correction2),
         (parameter, gradient, exp_avg, exp_avg_sq),
     )
-    lanes, kernel = (4, _adam4) if parameter.is_cuda else (16, _adam16)
-    whole, rest = divmod(parameter.numel(), lanes)
+    width, kernel = (4, _adam4) if parameter.is_cuda else (16, _adam16)
+    vectors, rest = divmod(parameter.numel(), width)
     if rest:
         flat = [tensor.view(-1) for tensor in tensors]
-        launch(_adam, rest, *scales, *(tensor[-rest:] for tensor in flat))
+        launch(_adam, rest, *factors, *(tensor[-rest:] for tensor in flat))
         tensors = tuple(tensor[:-rest] for tensor in flat)
-    launch(kernel, whole, *scales, *tensors)
+    launch(kernel, vectors, *factors, *tensors)
 
 
 @wp.func
-def _live(gradient: Any):
-    """1 where the gradient is not exactly zero, also where it is no number, which wp.min takes for missing; else 0.
+def _nonzero(gradient: Any):
+    """1 where the gradient is not exactly zero, NaN included, which wp.min takes for missing; else 0.
 
     Twice, as once does not take the smallest numbers up to 1.
     """
@@ -50,7 +50,7 @@ def _live(gradient: Any):
 
 
 @wp.func
-def _root(x: vec16):
+def _sqrt(x: vec16):
     return vec16(
         wp.sqrt(x[0]),
         wp.sqrt(x[1]),
@@ -72,7 +72,7 @@ def _root(x: vec16):
 
 
 @wp.func
-def _root(x: wp.vec4):  # Warp's functions are chosen by the types of their arguments
+def _sqrt(x: wp.vec4):  # Warp's functions are chosen by the types of their arguments
     return wp.vec4(wp.sqrt(x[0]), wp.sqrt(x[1]), wp.sqrt(x[2]), wp.sqrt(x[3]))
 
 
@@ -87,13 +87,13 @@ def _adam_entry(
     exp_avg_sq: wp.array[Any],
 ):
     g = gradient[i]
-    live = _live(g)
-    if wp.max(live) == 0.0:  # of the gradients themselves it would pass over what is not a number
+    nonzero = _nonzero(g)
+    if wp.max(nonzero) == 0.0:  # of the gradients themselves it would pass over NaN
         return
-    m = exp_avg[i] + _ONE_MINUS_BETA1 * wp.cw_mul(live, g - exp_avg[i])
-    v = exp_avg_sq[i] + _ONE_MINUS_BETA2 * wp.cw_mul(live, wp.cw_mul(g, g) - exp_avg_sq[i])
-    root = _root(wp.max(correction * v, type(v)(_EPSILON_SQUARED)))
-    parameter[i] = parameter[i] - wp.cw_div(wp.cw_mul(live, learning_rate * m), root)
+    m = exp_avg[i] + _ONE_MINUS_BETA1 * wp.cw_mul(nonzero, g - exp_avg[i])
+    v = exp_avg_sq[i] + _ONE_MINUS_BETA2 * wp.cw_mul(nonzero, wp.cw_mul(g, g) - exp_avg_sq[i])
+    denominator = _sqrt(wp.max(correction * v, type(v)(_EPSILON_SQUARED)))
+    parameter[i] = parameter[i] - wp.cw_div(wp.cw_mul(nonzero, learning_rate * m), denominator)
     exp_avg[i] = m
     exp_avg_sq[i] = v
     gradient[i] = type(g)(0.0)

@@ -16,21 +16,23 @@ def select_colour_samples(
     samples: Samples,
     sigma: Float[Tensor, "samples"],
     opacity_step: float,
-    depth: Float64[Tensor, "rays"],
+    optical_depth: Float64[Tensor, "rays"],
     accumulated: Float[Tensor, "rays"],
 ) -> ColourSamples:
     """As in nerf.kernels.torch.colour_sampling."""
-    rays, device = len(depth), sigma.device
+    rays, device = len(optical_depth), sigma.device
     counts = torch.zeros(rays + 1, dtype=torch.int32, device=device)
-    found, found_weights = torch.empty_like(samples.ray), torch.empty_like(sigma)
+    selected_index, selected_weights = torch.empty_like(samples.ray), torch.empty_like(sigma)
     packed = samples.starts, samples.dt, sigma
-    launch(_find, rays, *packed, 1 / opacity_step, depth, accumulated, counts, found, found_weights)
+    launch(
+        _select, rays, *packed, 1 / opacity_step, optical_depth, accumulated, counts, selected_index, selected_weights
+    )
     starts = counts.cumsum(0, dtype=torch.int32)
     total = int(starts[-1])
     index, ray = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
     t, dt, weights = (torch.empty(total, device=device) for _ in range(3))
-    kept = samples.starts, starts, samples.t, samples.dt, found, found_weights
-    launch(_keep, rays, *kept, index, ray, t, dt, weights)
+    selected = samples.starts, starts, samples.t, samples.dt, selected_index, selected_weights
+    launch(_pack, rays, *selected, index, ray, t, dt, weights)
     return ColourSamples(Samples(starts, ray, t, dt), index, weights)
 
 
@@ -38,19 +40,19 @@ def accumulate_colours(
     selected: ColourSamples, colour: Float[Tensor, "kept 3"], rendered: Float[Tensor, "rays 4"]
 ) -> None:
     """As in nerf.kernels.torch.colour_sampling."""
-    launch(_add, len(rendered), selected.samples.starts, selected.samples.t, selected.weights, colour, rendered)
+    launch(_accumulate, len(rendered), selected.samples.starts, selected.samples.t, selected.weights, colour, rendered)
 
 
 @wp.kernel
-def _find(
+def _select(
     starts: wp.array[int],
     lengths: wp.array[float],
     sigma: wp.array[float],
     steps_per_opacity: float,
-    depth: wp.array[wp.float64],
+    optical_depth: wp.array[wp.float64],
     accumulated: wp.array[float],
     counts: wp.array[int],
-    found: wp.array[int],
+    selected_index: wp.array[int],
     weights: wp.array[float],
 ):
     ray = wp.tid()
@@ -59,33 +61,33 @@ def _find(
     counts[ray + 1] = 0
     if start == end:
         return
-    tau = depth[ray]
+    tau = optical_depth[ray]
     previous = accumulated[ray]
-    steps = wp.floor(opacity_of(float(tau)) * steps_per_opacity + 0.5)
-    place = int(start)
+    steps_before = wp.floor(opacity_of(float(tau)) * steps_per_opacity + 0.5)
+    entry = int(start)
     for i in range(start, end):
         tau += wp.float64(optical_thickness(sigma[i], lengths[i]))
-        here = opacity_of(float(tau))
-        now = wp.floor(here * steps_per_opacity + 0.5)
+        opacity = opacity_of(float(tau))
+        completed = wp.floor(opacity * steps_per_opacity + 0.5)
         # Written in any case, as a branch that is taken half of the time costs more.
-        found[place] = i
-        weights[place] = here - previous
-        keep = now > steps
-        previous = wp.where(keep, here, previous)
-        place += int(keep)
-        steps = now
-    depth[ray] = tau
+        selected_index[entry] = i
+        weights[entry] = opacity - previous
+        is_selected = completed > steps_before
+        previous = wp.where(is_selected, opacity, previous)
+        entry += int(is_selected)
+        steps_before = completed
+    optical_depth[ray] = tau
     accumulated[ray] = previous
-    counts[ray + 1] = place - start
+    counts[ray + 1] = entry - start
 
 
 @wp.kernel
-def _keep(
+def _pack(
     starts: wp.array[int],
     kept_starts: wp.array[int],
     distances: wp.array[float],
     lengths: wp.array[float],
-    found: wp.array[int],
+    selected_index: wp.array[int],
     weights: wp.array[float],
     index: wp.array[int],
     rays: wp.array[int],
@@ -96,17 +98,17 @@ def _keep(
     ray = wp.tid()
     start = starts[ray]
     first = kept_starts[ray]
-    for place in range(first, kept_starts[ray + 1]):
-        i = found[start + place - first]
-        index[place] = i
-        rays[place] = ray
-        kept_distances[place] = distances[i]
-        kept_lengths[place] = lengths[i]
-        kept_weights[place] = weights[start + place - first]
+    for entry in range(first, kept_starts[ray + 1]):
+        i = selected_index[start + entry - first]
+        index[entry] = i
+        rays[entry] = ray
+        kept_distances[entry] = distances[i]
+        kept_lengths[entry] = lengths[i]
+        kept_weights[entry] = weights[start + entry - first]
 
 
 @wp.kernel
-def _add(
+def _accumulate(
     starts: wp.array[int],
     distances: wp.array[float],
     weights: wp.array[float],
@@ -119,5 +121,5 @@ def _add(
     for i in range(starts[ray], starts[ray + 1]):
         sum_colour += wp.vec3d(weights[i] * colour[i])
         sum_distance += wp.float64(weights[i] * distances[i])
-    more = wp.vec3(sum_colour)
-    rendered[ray] += wp.vec4(more[0], more[1], more[2], float(sum_distance))
+    added = wp.vec3(sum_colour)
+    rendered[ray] += wp.vec4(added[0], added[1], added[2], float(sum_distance))

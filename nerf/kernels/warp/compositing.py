@@ -77,9 +77,9 @@ def composite_backward(
 
 def distortion(samples: Samples, weights: Float[Tensor, "samples"], stepping: RayStepping) -> Float[Tensor, "rays"]:
     """As in nerf.kernels.torch.compositing."""
-    spread = weights.new_empty(len(samples.starts) - 1)
-    launch(_distortion, len(spread), grows_from(stepping), samples.starts, samples.t, samples.dt, weights, spread)
-    return spread
+    loss = weights.new_empty(len(samples.starts) - 1)
+    launch(_distortion, len(loss), log_from(stepping), samples.starts, samples.t, samples.dt, weights, loss)
+    return loss
 
 
 def distortion_backward(
@@ -88,18 +88,18 @@ def distortion_backward(
     """As in nerf.kernels.torch.compositing."""
     grad_weights = torch.empty_like(weights)
     packed = samples.starts, samples.t, samples.dt, weights
-    launch(_distortion_backward, len(grad), grows_from(stepping), *packed, grad, grad_weights)
+    launch(_distortion_backward, len(grad), log_from(stepping), *packed, grad, grad_weights)
     return grad_weights
 
 
-def grows_from(stepping: RayStepping) -> float:
-    """The distance from which steps grow; 0 where they never do."""
+def log_from(stepping: RayStepping) -> float:
+    """The distance from which losses measure it by its logarithm, as steps grow from there; 0 where they never do."""
     return stepping.linear_until if stepping.cone_angle else 0.0
 
 
 @wp.func
 def optical_thickness(sigma: float, length: float):
-    """At most OPAQUE. Not by wp.min, which takes NaN for missing: a density that is no number would look solid."""
+    """At most OPAQUE. Not by wp.min, which takes NaN for missing: a density of NaN would look solid."""
     tau = sigma * length
     return wp.where(tau > _OPAQUE, _OPAQUE, tau)
 
@@ -114,7 +114,7 @@ def opacity_of(tau: float):
 
 @wp.func
 def _keep_probability(tau: float, thinning_threshold: float):
-    """Of a sample to be kept; 1 for what is no number."""
+    """Of a sample; 1 for NaN."""
     if tau < thinning_threshold:
         return wp.max(tau / thinning_threshold, _MIN_KEEP_PROBABILITY)
     return 1.0
@@ -132,18 +132,18 @@ def _count_visible(
 ):
     ray = wp.tid()
     tau = wp.float64(0.0)
-    probabilities = wp.float64(offsets[ray])
+    running = wp.float64(offsets[ray])
     count = int(0)
     i = int(starts[ray])
     end = starts[ray + 1]
     while i < end and wp.exp(-float(tau)) >= threshold:
-        more = optical_thickness(sigma[i], lengths[i])
-        tau += wp.float64(more)
-        probability = _keep_probability(more, thinning_threshold)
+        sample_tau = optical_thickness(sigma[i], lengths[i])
+        tau += wp.float64(sample_tau)
+        probability = _keep_probability(sample_tau, thinning_threshold)
         if probability < 1.0:
-            before = wp.floor(probabilities)
-            probabilities += wp.float64(probability)
-            count += int(wp.floor(probabilities) - before)
+            before = wp.floor(running)
+            running += wp.float64(probability)
+            count += int(wp.floor(running) - before)
         else:
             count += 1
         i += 1
@@ -165,23 +165,23 @@ def _keep_visible(
     kept_lengths: wp.array[float],
 ):
     ray = wp.tid()
-    probabilities = wp.float64(offsets[ray])
-    place = int(kept_starts[ray])
+    running = wp.float64(offsets[ray])
+    entry = int(kept_starts[ray])
     end = kept_starts[ray + 1]
     i = int(starts[ray])
-    while place < end:
+    while entry < end:
         probability = _keep_probability(optical_thickness(sigma[i], lengths[i]), thinning_threshold)
         kept = bool(True)
         if probability < 1.0:
-            before = wp.floor(probabilities)
-            probabilities += wp.float64(probability)
-            kept = wp.floor(probabilities) > before
+            before = wp.floor(running)
+            running += wp.float64(probability)
+            kept = wp.floor(running) > before
         if kept:
-            index[place] = i
-            rays[place] = ray
-            kept_distances[place] = distances[i]
-            kept_lengths[place] = lengths[i] / probability
-            place += 1
+            index[entry] = i
+            rays[entry] = ray
+            kept_distances[entry] = distances[i]
+            kept_lengths[entry] = lengths[i] / probability
+            entry += 1
         i += 1
 
 
@@ -194,7 +194,7 @@ def _composite(
     colour: wp.array[wp.vec3],
     background: wp.array[wp.vec3],
     far: wp.array[float],
-    seen: wp.array[wp.vec3],
+    rgb: wp.array[wp.vec3],
     depth: wp.array[float],
     opacity: wp.array[float],
     weights: wp.array[float],
@@ -204,14 +204,14 @@ def _composite(
     sum_colour = wp.vec3d()
     sum_depth = wp.float64(0.0)
     for i in range(starts[ray], starts[ray + 1]):
-        more = optical_thickness(sigma[i], lengths[i])
-        weight = wp.exp(-float(tau)) * opacity_of(more)
-        tau += wp.float64(more)
+        sample_tau = optical_thickness(sigma[i], lengths[i])
+        weight = wp.exp(-float(tau)) * opacity_of(sample_tau)
+        tau += wp.float64(sample_tau)
         weights[i] = weight
         sum_colour += wp.vec3d(weight * colour[i])
         sum_depth += wp.float64(weight * distances[i])
     transmittance = wp.exp(-float(tau))
-    seen[ray] = wp.vec3(sum_colour) + transmittance * background[ray]
+    rgb[ray] = wp.vec3(sum_colour) + transmittance * background[ray]
     depth[ray] = float(sum_depth) + transmittance * far[ray]
     opacity[ray] = opacity_of(float(tau))
 
@@ -225,7 +225,7 @@ def _composite_backward(
     colour: wp.array[wp.vec3],
     background: wp.array[wp.vec3],
     far: wp.array[float],
-    grad_seen: wp.array[wp.vec3],
+    grad_rgb: wp.array[wp.vec3],
     grad_depth: wp.array[float],
     grad_opacity: wp.array[float],
     grad_weights: wp.array[float],
@@ -237,37 +237,38 @@ def _composite_backward(
     end = starts[ray + 1]
     tau = wp.float64(0.0)
     for i in range(start, end):
-        grad_sigma[i] = float(tau)  # what lies before the sample, for the way back
+        grad_sigma[i] = float(tau)  # optical depth before the sample, for the second pass
         tau += wp.float64(optical_thickness(sigma[i], lengths[i]))
-    on_seen = grad_seen[ray]
-    on_depth = grad_depth[ray]
-    on_unstopped = wp.dot(on_seen, background[ray]) + on_depth * far[ray] - grad_opacity[ray]
-    behind = wp.float64(wp.exp(-float(tau)) * on_unstopped)
+    ray_grad_rgb = grad_rgb[ray]
+    ray_grad_depth = grad_depth[ray]
+    grad_transmittance = wp.dot(ray_grad_rgb, background[ray]) + ray_grad_depth * far[ray] - grad_opacity[ray]
+    behind = wp.float64(wp.exp(-float(tau)) * grad_transmittance)
     for step in range(end - start):
         i = end - 1 - step
-        more = optical_thickness(sigma[i], lengths[i])
+        sample_tau = optical_thickness(sigma[i], lengths[i])
         before = wp.exp(-grad_sigma[i])
-        weight = before * opacity_of(more)
-        g = grad_weights[i] + wp.dot(on_seen, colour[i]) + on_depth * distances[i]
-        grad_sigma[i] = lengths[i] * (before * wp.exp(-more) * g - float(behind))
-        grad_colour[i] = weight * on_seen
+        weight = before * opacity_of(sample_tau)
+        g = grad_weights[i] + wp.dot(ray_grad_rgb, colour[i]) + ray_grad_depth * distances[i]
+        grad_sigma[i] = lengths[i] * (before * wp.exp(-sample_tau) * g - float(behind))
+        grad_colour[i] = weight * ray_grad_rgb
         behind += wp.float64(weight * g)
 
 
 @wp.func
-def apart(grows_from: float, start: float, end: float):
-    """m(end) - m(start), where m is the distance as the losses measure it: its logarithm where steps grow.
+def normalised_difference(log_from: float, start: float, end: float):
+    """m(end) - m(start), where m is the distance as the losses measure it: its logarithm beyond ``log_from``
+    (0: nowhere), in multiples of it before (nerf.kernels.torch.marching.normalised_distance).
 
     No difference of two logarithms: each is off by 5e-7 far out, where neighbours differ by 1e-2. Nor the logarithm of
     end / start, whose rounding is 6e-8 of 1. With z = (end - start) / (end + start), whose difference is exact for
     neighbours, log(end / start) = 2 artanh z; its series is as exact as float64 would be once rounded, and cheaper than
     any logarithm.
     """
-    if grows_from == 0.0:
+    if log_from == 0.0:
         return end - start
-    even = (wp.min(end, grows_from) - wp.min(start, grows_from)) / grows_from
-    a = wp.max(start, grows_from)
-    b = wp.max(end, grows_from)
+    even = (wp.min(end, log_from) - wp.min(start, log_from)) / log_from
+    a = wp.max(start, log_from)
+    b = wp.max(end, log_from)
     z = (b - a) / (b + a)
     if wp.abs(z) > _SERIES_BELOW:
         return even + wp.log(b / a)
@@ -276,20 +277,20 @@ def apart(grows_from: float, start: float, end: float):
 
 
 @wp.func
-def _length(grows_from: float, t: float, dt: float):
-    if grows_from == 0.0:
+def _normalised_length(log_from: float, t: float, dt: float):
+    if log_from == 0.0:
         return dt
-    return dt / wp.max(grows_from, t)
+    return dt / wp.max(log_from, t)
 
 
 @wp.kernel
 def _distortion(
-    grows_from: float,
+    log_from: float,
     starts: wp.array[int],
     distances: wp.array[float],
     lengths: wp.array[float],
     weights: wp.array[float],
-    spread: wp.array[float],
+    loss: wp.array[float],
 ):
     ray = wp.tid()
     # Sums of w_j and w_j (m - m_j) over the samples before, m being the position of the last: no large numbers meet.
@@ -300,17 +301,17 @@ def _distortion(
     for i in range(starts[ray], starts[ray + 1]):
         t = distances[i]
         w = weights[i]
-        own = w * _length(grows_from, t, lengths[i]) / 3.0
-        moment += before * wp.float64(apart(grows_from, last, t))
-        total += wp.float64(w * (2.0 * float(moment) + own))
+        own_term = w * _normalised_length(log_from, t, lengths[i]) / 3.0
+        moment += before * wp.float64(normalised_difference(log_from, last, t))
+        total += wp.float64(w * (2.0 * float(moment) + own_term))
         before += wp.float64(w)
         last = t
-    spread[ray] = float(total)
+    loss[ray] = float(total)
 
 
 @wp.kernel
 def _distortion_backward(
-    grows_from: float,
+    log_from: float,
     starts: wp.array[int],
     distances: wp.array[float],
     lengths: wp.array[float],
@@ -326,9 +327,9 @@ def _distortion_backward(
     last = float(0.0)
     for i in range(start, end):
         t = distances[i]
-        own = weights[i] * _length(grows_from, t, lengths[i]) / 3.0
-        moment += before * wp.float64(apart(grows_from, last, t))
-        grad_weights[i] = grad[ray] * 2.0 * (float(moment) + own)
+        own_term = weights[i] * _normalised_length(log_from, t, lengths[i]) / 3.0
+        moment += before * wp.float64(normalised_difference(log_from, last, t))
+        grad_weights[i] = grad[ray] * 2.0 * (float(moment) + own_term)
         before += wp.float64(weights[i])
         last = t
     behind = wp.float64(0.0)
@@ -336,7 +337,7 @@ def _distortion_backward(
     for step in range(end - start):
         i = end - 1 - step
         t = distances[i]
-        moment += behind * wp.float64(apart(grows_from, t, last))
+        moment += behind * wp.float64(normalised_difference(log_from, t, last))
         grad_weights[i] = grad_weights[i] + grad[ray] * 2.0 * float(moment)
         behind += wp.float64(weights[i])
         last = t

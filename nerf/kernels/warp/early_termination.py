@@ -22,12 +22,24 @@ def finish_round(
     threshold: float,
     jitter: Float[Tensor, "rays"],
     far: Float[Tensor, "rays"],
-    depth: Float64[Tensor, "rays"],
+    optical_depth: Float64[Tensor, "rays"],
     near: Float[Tensor, "rays"],
 ) -> None:
     """As in nerf.kernels.torch.early_termination."""
     sizes, packed = stepping[:2], (samples.starts, samples.t, samples.dt)
-    launch(_finish_round, len(far), *sizes, stepping.max_samples, *packed, sigma, threshold, jitter, far, depth, near)
+    launch(
+        _finish_round,
+        len(far),
+        *sizes,
+        stepping.max_samples,
+        *packed,
+        sigma,
+        threshold,
+        jitter,
+        far,
+        optical_depth,
+        near,
+    )
 
 
 def pack_rounds(rounds: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]:
@@ -36,18 +48,18 @@ def pack_rounds(rounds: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samp
     total, device, before = sum(len(each.t) for each in rounds), starts.device, 0
     order, ray = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
     t, dt = (torch.empty(total, device=device) for _ in range(2))
-    placed = starts[:-1].clone()
+    next_entry = starts[:-1].clone()
     for each in rounds:
-        launch(_place_round, rays, each.starts, each.t, each.dt, before, placed, order, ray, t, dt)
+        launch(_pack_round, rays, each.starts, each.t, each.dt, before, next_entry, order, ray, t, dt)
         before += len(each.t)
     return Samples(starts, ray, t, dt), order
 
 
 @wp.kernel
 def _finish_round(
-    step: float,
-    cone: float,
-    most: int,
+    step_size: float,
+    cone_angle: float,
+    max_samples: int,
     starts: wp.array[int],
     distances: wp.array[float],
     lengths: wp.array[float],
@@ -55,41 +67,41 @@ def _finish_round(
     threshold: float,
     jitter: wp.array[float],
     far: wp.array[float],
-    depth: wp.array[wp.float64],
+    optical_depth: wp.array[wp.float64],
     near: wp.array[float],
 ):
     ray = wp.tid()
     start = starts[ray]
     end = starts[ray + 1]
-    tau = depth[ray]
+    tau = optical_depth[ray]
     for i in range(start, end):
         tau += wp.float64(optical_thickness(sigma[i], lengths[i]))
-    depth[ray] = tau
-    onward = far[ray]
-    if end - start == most and wp.exp(-float(tau)) >= threshold:
-        s = t_to_s(step, cone, distances[end - 1]) + (1.0 - jitter[ray])
-        onward = wp.min(onward, s_to_t(step, cone, s))
-    near[ray] = onward
+    optical_depth[ray] = tau
+    next_near = far[ray]
+    if end - start == max_samples and wp.exp(-float(tau)) >= threshold:
+        s = t_to_s(step_size, cone_angle, distances[end - 1]) + (1.0 - jitter[ray])
+        next_near = wp.min(next_near, s_to_t(step_size, cone_angle, s))
+    near[ray] = next_near
 
 
 @wp.kernel
-def _place_round(
+def _pack_round(
     starts: wp.array[int],
     distances: wp.array[float],
     lengths: wp.array[float],
     before: int,
-    placed: wp.array[int],
+    next_entry: wp.array[int],
     order: wp.array[int],
     rays: wp.array[int],
-    all_distances: wp.array[float],
-    all_lengths: wp.array[float],
+    packed_distances: wp.array[float],
+    packed_lengths: wp.array[float],
 ):
     ray = wp.tid()
-    place = placed[ray]
+    entry = next_entry[ray]
     for i in range(starts[ray], starts[ray + 1]):
-        order[place] = before + i
-        rays[place] = ray
-        all_distances[place] = distances[i]
-        all_lengths[place] = lengths[i]
-        place += 1
-    placed[ray] = place
+        order[entry] = before + i
+        rays[entry] = ray
+        packed_distances[entry] = distances[i]
+        packed_lengths[entry] = lengths[i]
+        entry += 1
+    next_entry[ray] = entry

@@ -15,7 +15,8 @@ wp.set_module_options({"enable_backward": False})
 _PRIME_Y = wp.constant(wp.uint32(2654435761))
 _PRIME_Z = wp.constant(wp.uint32(805459861))
 FEATURES = 4  # of a vertex: a row of the table is one vec4
-_AHEAD = wp.constant(8)  # points for which rows are fetched before their turn (docs/experiments/step_time.md)
+# Rows of the point so many ahead are fetched beforehand (docs/experiments/step_time.md).
+_PREFETCH_DISTANCE = wp.constant(8)
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
 
@@ -28,7 +29,7 @@ def encode(
     levels = _levels(layout, points.device)
     count = len(layout.resolutions)
     if points.is_cuda:
-        launch(_encode_lanes, count * len(points), levels, count, table, points, features)
+        launch(_encode_gpu, count * len(points), levels, count, table, points, features)
     else:
         launch(_encode, len(points), levels, count, table, points, features)
     return features
@@ -44,7 +45,7 @@ def encode_backward_table(
     """As in nerf.kernels.torch.encoding. Points are added in their order on the CPU, in any order on a GPU."""
     sizes, tensors = (_levels(layout, points.device), len(layout.resolutions)), (points, grad_features, grad_table)
     if points.is_cuda:
-        launch(_encode_backward_table_lanes, len(levels) * len(points), *sizes, levels.start, len(points), *tensors)
+        launch(_encode_backward_table_gpu, len(levels) * len(points), *sizes, levels.start, len(points), *tensors)
         return
     for level in levels:
         launch(_encode_backward_table, len(points), *sizes, level, *tensors)
@@ -105,12 +106,21 @@ def _corner_rows(level: wp.vec4i, x: int, y: int, z: int):
         )
     side = level[0] + 1
     first = level[1] + (x * side + y) * side + z
-    far = first + side * side
-    return vec8i(first, first + 1, first + side, first + side + 1, far, far + 1, far + side, far + side + 1)
+    next_plane = first + side * side
+    return vec8i(
+        first,
+        first + 1,
+        first + side,
+        first + side + 1,
+        next_plane,
+        next_plane + 1,
+        next_plane + side,
+        next_plane + side + 1,
+    )
 
 
 @wp.func
-def _corner_shares(u: float, v: float, w: float):
+def _corner_weights(u: float, v: float, w: float):
     """Trilinear weights of the corners."""
     a = (1.0 - u) * (1.0 - v)
     b = (1.0 - u) * v
@@ -121,30 +131,30 @@ def _corner_shares(u: float, v: float, w: float):
 
 
 @wp.func
-def _around(level: wp.vec4i, point: wp.vec3):
+def _cell_around(level: wp.vec4i, point: wp.vec3):
     """The cell of a point, table rows of its corners and their trilinear weights."""
     scaled = float(level[0]) * point
     x = _cell(scaled[0], level[0])
     y = _cell(scaled[1], level[0])
     z = _cell(scaled[2], level[0])
-    shares = _corner_shares(scaled[0] - float(x), scaled[1] - float(y), scaled[2] - float(z))
-    return wp.vec3i(x, y, z), _corner_rows(level, x, y, z), shares
+    weights = _corner_weights(scaled[0] - float(x), scaled[1] - float(y), scaled[2] - float(z))
+    return wp.vec3i(x, y, z), _corner_rows(level, x, y, z), weights
 
 
-# In C++, since sums of share * row with wp.vec4 compile to two loads, products and sums per corner (Warp 1.19, x86).
+# In C++, since sums of weight * row with wp.vec4 compile to two loads, products and sums per corner (Warp 1.19, x86).
 @wp.func_native("""
-    float mean[4] = {0.0f};
-    assert(place >= 0 && place < features.shape[0]);
+    float sum[4] = {0.0f};
+    assert(entry >= 0 && entry < features.shape[0]);
     for (int corner = 0; corner < 8; ++corner)
         assert(rows.c[corner] >= 0 && rows.c[corner] < table.shape[0]);
     for (int corner = 0; corner < 8; ++corner)
         for (int k = 0; k < 4; ++k)
-            mean[k] += shares.c[corner] * table.data[rows.c[corner]].c[k];
+            sum[k] += weights.c[corner] * table.data[rows.c[corner]].c[k];
     for (int k = 0; k < 4; ++k)
-        features.data[place].c[k] = mean[k];
+        features.data[entry].c[k] = sum[k];
 """)
-def _interpolate(table: wp.array[wp.vec4], rows: vec8i, shares: vec8, features: wp.array[wp.vec4], place: int):
-    """features[place] = sum of shares times rows of the table."""
+def _interpolate(table: wp.array[wp.vec4], rows: vec8i, weights: vec8, features: wp.array[wp.vec4], entry: int):
+    """features[entry] = sum of weights times rows of the table."""
 
 
 # A CPU's core spends most of these kernels waiting for memory, so it asks for the rows of later points beforehand. A
@@ -160,7 +170,7 @@ def _prefetch(table: wp.array[wp.vec4], rows: vec8i):
 
 
 @wp.func
-def _prefetch_around(table: wp.array[wp.vec4], level: wp.vec4i, point: wp.vec3):
+def _prefetch_cell(table: wp.array[wp.vec4], level: wp.vec4i, point: wp.vec3):
     """The rows around a point. Those of grids without a hash stand in order, mostly few: caches do without."""
     if level[3] != 0:
         scaled = float(level[0]) * point
@@ -170,9 +180,9 @@ def _prefetch_around(table: wp.array[wp.vec4], level: wp.vec4i, point: wp.vec3):
 
 
 @wp.func
-def _ahead(points: wp.array[wp.vec3], i: int):
+def _point_ahead(points: wp.array[wp.vec3], i: int):
     """The point whose rows are to be fetched at the turn of number i."""
-    return points[wp.min(i + _AHEAD, points.shape[0] - 1)]
+    return points[wp.min(i + _PREFETCH_DISTANCE, points.shape[0] - 1)]
 
 
 @wp.kernel
@@ -185,16 +195,16 @@ def _encode(
 ):
     i = wp.tid()
     point = points[i]
-    later = _ahead(points, i)
+    later = _point_ahead(points, i)
     for index in range(count):
         level = levels[index]
-        _prefetch_around(table, level, later)
-        _, rows, shares = _around(level, point)
-        _interpolate(table, rows, shares, features, i * count + index)
+        _prefetch_cell(table, level, later)
+        _, rows, weights = _cell_around(level, point)
+        _interpolate(table, rows, weights, features, i * count + index)
 
 
 @wp.kernel
-def _encode_lanes(
+def _encode_gpu(
     levels: wp.array[wp.vec4i],
     count: int,
     table: wp.array[wp.vec4],
@@ -204,8 +214,8 @@ def _encode_lanes(
     """A thread per level of a point: on a GPU neighbouring threads should touch neighbouring memory."""
     i = wp.tid()
     level = levels[i % count]
-    _, rows, shares = _around(level, points[i / count])
-    _interpolate(table, rows, shares, features, i)
+    _, rows, weights = _cell_around(level, points[i / count])
+    _interpolate(table, rows, weights, features, i)
 
 
 @wp.kernel
@@ -219,11 +229,11 @@ def _encode_backward_table(
 ):
     i = wp.tid()
     level = levels[index]
-    _prefetch_around(grad_table, level, _ahead(points, i))
-    _, rows, shares = _around(level, points[i])
+    _prefetch_cell(grad_table, level, _point_ahead(points, i))
+    _, rows, weights = _cell_around(level, points[i])
     grad = grad_features[i * count + index]
     for corner in range(8):
-        wp.atomic_add(grad_table, rows[corner], shares[corner] * grad)
+        wp.atomic_add(grad_table, rows[corner], weights[corner] * grad)
 
 
 # Neighbouring threads of a GPU have neighbouring samples, of which many share the cell of a coarse grid: thousands
@@ -233,7 +243,7 @@ def _encode_backward_table(
     float sums[8][4];
     for (int corner = 0; corner < 8; ++corner)
         for (int k = 0; k < 4; ++k)
-            sums[corner][k] = shares.c[corner] * grad.c[k];
+            sums[corner][k] = weights.c[corner] * grad.c[k];
     bool adds = true;
 #ifdef __CUDA_ARCH__
     const unsigned active = __activemask();
@@ -276,13 +286,13 @@ def _encode_backward_table(
         }
 """)
 def _add_to_rows(
-    grad_table: wp.array[wp.vec4], rows: vec8i, shares: vec8, grad: wp.vec4, level: int, x: int, y: int, z: int
+    grad_table: wp.array[wp.vec4], rows: vec8i, weights: vec8, grad: wp.vec4, level: int, x: int, y: int, z: int
 ):
-    """grad_table[rows] += shares times grad, for the corners of cell (x, y, z) of a level."""
+    """grad_table[rows] += weights times grad, for the corners of cell (x, y, z) of a level."""
 
 
 @wp.kernel
-def _encode_backward_table_lanes(
+def _encode_backward_table_gpu(
     levels: wp.array[wp.vec4i],
     count: int,
     first: int,
@@ -295,8 +305,8 @@ def _encode_backward_table_lanes(
     i = wp.tid() % number
     index = first + wp.tid() / number
     level = levels[index]
-    cell, rows, shares = _around(level, points[i])
-    _add_to_rows(grad_table, rows, shares, grad_features[i * count + index], index, cell[0], cell[1], cell[2])
+    cell, rows, weights = _cell_around(level, points[i])
+    _add_to_rows(grad_table, rows, weights, grad_features[i * count + index], index, cell[0], cell[1], cell[2])
 
 
 @wp.kernel
@@ -310,10 +320,10 @@ def _encode_backward_points(
 ):
     i = wp.tid()
     total = wp.vec3(0.0, 0.0, 0.0)
-    later = _ahead(points, i)
+    later = _point_ahead(points, i)
     for index in range(count):
         level = levels[index]
-        _prefetch_around(table, level, later)
+        _prefetch_cell(table, level, later)
         scaled = float(level[0]) * points[i]
         x = _cell(scaled[0], level[0])
         y = _cell(scaled[1], level[0])
@@ -323,7 +333,7 @@ def _encode_backward_points(
         w = scaled[2] - float(z)
         rows = _corner_rows(level, x, y, z)
         grad = grad_features[i * count + index]
-        # What the loss gains per unit of each corner's share.
+        # What the loss gains per unit of each corner's weight.
         g000 = wp.dot(grad, table[rows[0]])
         g001 = wp.dot(grad, table[rows[1]])
         g010 = wp.dot(grad, table[rows[2]])
@@ -332,8 +342,8 @@ def _encode_backward_points(
         g101 = wp.dot(grad, table[rows[5]])
         g110 = wp.dot(grad, table[rows[6]])
         g111 = wp.dot(grad, table[rows[7]])
-        on_x = wp.lerp(wp.lerp(g100 - g000, g101 - g001, w), wp.lerp(g110 - g010, g111 - g011, w), v)
-        on_y = wp.lerp(wp.lerp(g010 - g000, g011 - g001, w), wp.lerp(g110 - g100, g111 - g101, w), u)
-        on_z = wp.lerp(wp.lerp(g001 - g000, g011 - g010, v), wp.lerp(g101 - g100, g111 - g110, v), u)
-        total += float(level[0]) * wp.vec3(on_x, on_y, on_z)
+        grad_x = wp.lerp(wp.lerp(g100 - g000, g101 - g001, w), wp.lerp(g110 - g010, g111 - g011, w), v)
+        grad_y = wp.lerp(wp.lerp(g010 - g000, g011 - g001, w), wp.lerp(g110 - g100, g111 - g101, w), u)
+        grad_z = wp.lerp(wp.lerp(g001 - g000, g011 - g010, v), wp.lerp(g101 - g100, g111 - g110, v), u)
+        total += float(level[0]) * wp.vec3(grad_x, grad_y, grad_z)
     grad_points[i] = total

@@ -15,12 +15,12 @@ def gather_rows(values: Float[Tensor, "rows width"], rows: Int32[Tensor, "chosen
         return values.index_select(0, rows)
     # Torch gives each row of 16 to 64 numbers a block of threads of its own, which takes several times as long
     # (docs/experiments/gpu.md).
-    gathered, lanes = values.new_empty(len(rows), values.shape[1]), values.shape[1] // 4
-    launch(_gather_rows, lanes * len(rows), lanes, values, rows, gathered)
+    gathered, vectors = values.new_empty(len(rows), values.shape[1]), values.shape[1] // 4
+    launch(_gather_rows, vectors * len(rows), vectors, values, rows, gathered)
     return gathered
 
 
 @wp.kernel
-def _gather_rows(lanes: int, values: wp.array[wp.vec4], rows: wp.array[int], gathered: wp.array[wp.vec4]):
+def _gather_rows(vectors: int, values: wp.array[wp.vec4], rows: wp.array[int], gathered: wp.array[wp.vec4]):
     i = wp.tid()
-    gathered[i] = values[rows[i / lanes] * lanes + i % lanes]
+    gathered[i] = values[rows[i / vectors] * vectors + i % vectors]

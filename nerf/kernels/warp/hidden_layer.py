@@ -13,17 +13,17 @@ from nerf.kernels.warp.launch import launch, vec16
 wp.set_module_options({"enable_backward": False})
 
 _HIDDEN = 64
-# On a GPU, whose neighbouring threads should touch neighbouring memory, a thread has four numbers of a row.
-LANES = 16
+# Of four numbers in a row. On a GPU each has a thread: neighbouring threads should touch neighbouring memory.
+VECTORS = 16
 # Samples whose gradients are summed by themselves before they join their ray's: of n numbers one after the other, in
 # float32, up to n half ulps are lost, here 64 + 64 for a ray of 4096. Sums in float64 take twice the vectors.
-_TOGETHER = wp.constant(64)
+_PARTIAL_SUM = wp.constant(64)
 
 
 def add_ray_relu(samples: Samples, hidden: Float[Tensor, "samples 64"], ray_hidden: Float[Tensor, "rays 64"]) -> None:
     """As in nerf.kernels.torch.hidden_layer."""
     if hidden.is_cuda:
-        launch(_add_ray_relu_lanes, LANES * len(hidden), samples.ray, ray_hidden, hidden)
+        launch(_add_ray_relu_gpu, VECTORS * len(hidden), samples.ray, ray_hidden, hidden)
     else:
         launch(_add_ray_relu, len(ray_hidden), samples.starts, ray_hidden, hidden)
 
@@ -34,7 +34,7 @@ def add_ray_relu_backward(
     """As in nerf.kernels.torch.hidden_layer."""
     ray_hidden = grad.new_empty(len(samples.starts) - 1, _HIDDEN)
     if hidden.is_cuda:
-        launch(_add_ray_relu_backward_lanes, LANES * len(ray_hidden), samples.starts, hidden, grad, ray_hidden)
+        launch(_add_ray_relu_backward_gpu, VECTORS * len(ray_hidden), samples.starts, hidden, grad, ray_hidden)
     else:
         launch(_add_ray_relu_backward, len(ray_hidden), samples.starts, hidden, grad, ray_hidden)
     return ray_hidden
@@ -43,20 +43,20 @@ def add_ray_relu_backward(
 def relu_backward(hidden: Float[Tensor, "samples 64"], grad: Float[Tensor, "samples 64"]) -> None:
     """As in nerf.kernels.torch.hidden_layer."""
     if hidden.is_cuda:
-        launch(_relu_backward_lanes, LANES * len(hidden), hidden, grad)
+        launch(_relu_backward_gpu, VECTORS * len(hidden), hidden, grad)
     else:
         launch(_relu_backward, 4 * len(hidden), hidden, grad)
 
 
 @wp.func
-def _rectified(x: Any):
-    """max(x, 0), and NaN where x is not a number: wp.max alone takes NaN for missing. 0 x changes no finite number."""
+def _relu(x: Any):
+    """max(x, 0), and NaN for NaN, which wp.max alone takes for missing. 0 x changes no finite number."""
     return wp.max(x, type(x)(0.0)) + 0.0 * x
 
 
 @wp.func
-def _where_positive(hidden: Any, grad: Any):
-    """The gradient where the layer let it through: hidden is zero or, twice multiplied, surely 1 or more."""
+def _relu_gradient(hidden: Any, grad: Any):
+    """The gradient where the output is positive, else 0: twice multiplied, what is positive is 1 or more."""
     one = type(hidden)(1.0)
     return wp.cw_mul(grad, wp.min(wp.min(3.0e38 * hidden, one) * 3.0e38, one))
 
@@ -69,10 +69,10 @@ def _add_ray_relu(starts: wp.array[int], ray_hidden: wp.array[vec16], hidden: wp
     c = ray_hidden[4 * ray + 2]
     d = ray_hidden[4 * ray + 3]
     for i in range(starts[ray], starts[ray + 1]):
-        hidden[4 * i] = _rectified(hidden[4 * i] + a)
-        hidden[4 * i + 1] = _rectified(hidden[4 * i + 1] + b)
-        hidden[4 * i + 2] = _rectified(hidden[4 * i + 2] + c)
-        hidden[4 * i + 3] = _rectified(hidden[4 * i + 3] + d)
+        hidden[4 * i] = _relu(hidden[4 * i] + a)
+        hidden[4 * i + 1] = _relu(hidden[4 * i + 1] + b)
+        hidden[4 * i + 2] = _relu(hidden[4 * i + 2] + c)
+        hidden[4 * i + 3] = _relu(hidden[4 * i + 3] + d)
 
 
 @wp.kernel
@@ -85,16 +85,16 @@ def _add_ray_relu_backward(
     ray_hidden[4 * ray + 1] = vec16(0.0)
     ray_hidden[4 * ray + 2] = vec16(0.0)
     ray_hidden[4 * ray + 3] = vec16(0.0)
-    for first in range(starts[ray], end, _TOGETHER):
+    for first in range(starts[ray], end, _PARTIAL_SUM):
         a = vec16(0.0)
         b = vec16(0.0)
         c = vec16(0.0)
         d = vec16(0.0)
-        for i in range(first, wp.min(first + _TOGETHER, end)):
-            grad[4 * i] = _where_positive(hidden[4 * i], grad[4 * i])
-            grad[4 * i + 1] = _where_positive(hidden[4 * i + 1], grad[4 * i + 1])
-            grad[4 * i + 2] = _where_positive(hidden[4 * i + 2], grad[4 * i + 2])
-            grad[4 * i + 3] = _where_positive(hidden[4 * i + 3], grad[4 * i + 3])
+        for i in range(first, wp.min(first + _PARTIAL_SUM, end)):
+            grad[4 * i] = _relu_gradient(hidden[4 * i], grad[4 * i])
+            grad[4 * i + 1] = _relu_gradient(hidden[4 * i + 1], grad[4 * i + 1])
+            grad[4 * i + 2] = _relu_gradient(hidden[4 * i + 2], grad[4 * i + 2])
+            grad[4 * i + 3] = _relu_gradient(hidden[4 * i + 3], grad[4 * i + 3])
             a += grad[4 * i]
             b += grad[4 * i + 1]
             c += grad[4 * i + 2]
@@ -108,36 +108,36 @@ def _add_ray_relu_backward(
 @wp.kernel
 def _relu_backward(hidden: wp.array[vec16], grad: wp.array[vec16]):
     i = wp.tid()
-    grad[i] = _where_positive(hidden[i], grad[i])
+    grad[i] = _relu_gradient(hidden[i], grad[i])
 
 
 @wp.kernel
-def _add_ray_relu_lanes(rays: wp.array[int], of_ray: wp.array[wp.vec4], hidden: wp.array[wp.vec4]):
+def _add_ray_relu_gpu(rays: wp.array[int], ray_hidden: wp.array[wp.vec4], hidden: wp.array[wp.vec4]):
     i = wp.tid()
-    hidden[i] = _rectified(hidden[i] + of_ray[16 * rays[i >> 4] + (i & 15)])
+    hidden[i] = _relu(hidden[i] + ray_hidden[16 * rays[i >> 4] + (i & 15)])
 
 
 @wp.kernel
-def _add_ray_relu_backward_lanes(
-    starts: wp.array[int], hidden: wp.array[wp.vec4], grad: wp.array[wp.vec4], of_ray: wp.array[wp.vec4]
+def _add_ray_relu_backward_gpu(
+    starts: wp.array[int], hidden: wp.array[wp.vec4], grad: wp.array[wp.vec4], ray_hidden: wp.array[wp.vec4]
 ):
     i = wp.tid()
     ray = i >> 4
-    lane = i & 15
+    vector = i & 15
     end = starts[ray + 1]
     total = wp.vec4(0.0)
-    for first in range(starts[ray], end, _TOGETHER):
-        some = wp.vec4(0.0)
-        for sample in range(first, wp.min(first + _TOGETHER, end)):
-            place = 16 * sample + lane
-            let_through = _where_positive(hidden[place], grad[place])
-            grad[place] = let_through
-            some += let_through
-        total += some
-    of_ray[i] = total
+    for first in range(starts[ray], end, _PARTIAL_SUM):
+        partial = wp.vec4(0.0)
+        for sample in range(first, wp.min(first + _PARTIAL_SUM, end)):
+            entry = 16 * sample + vector
+            passed = _relu_gradient(hidden[entry], grad[entry])
+            grad[entry] = passed
+            partial += passed
+        total += partial
+    ray_hidden[i] = total
 
 
 @wp.kernel
-def _relu_backward_lanes(hidden: wp.array[wp.vec4], grad: wp.array[wp.vec4]):
+def _relu_backward_gpu(hidden: wp.array[wp.vec4], grad: wp.array[wp.vec4]):
     i = wp.tid()
-    grad[i] = _where_positive(hidden[i], grad[i])
+    grad[i] = _relu_gradient(hidden[i], grad[i])

@@ -63,7 +63,7 @@ class _Recorded(NamedTuple):
     arrays: tuple[_Array | None, ...]
 
 
-_of_thread = threading.local()  # a recorded launch is changed before each run, so no two threads may share one
+_thread_local = threading.local()  # a recorded launch is changed before each run, so no two threads may share one
 _recording = threading.Lock()  # recording may compile and load code: twice at once would unload what already runs
 
 
@@ -78,7 +78,7 @@ def launch(kernel: wp.Kernel, count: int, *arguments: Argument) -> None:
         return
     device = next(argument.device for argument in arguments if isinstance(argument, Tensor))
     on_gpu = device.type == "cuda"
-    launches: dict[tuple[wp.Kernel, torch.device], _Recorded] = vars(_of_thread).setdefault("launches", {})
+    launches: dict[tuple[wp.Kernel, torch.device], _Recorded] = vars(_thread_local).setdefault("launches", {})
     recorded = launches.get((kernel, device))
     if recorded is None:
         with _recording:

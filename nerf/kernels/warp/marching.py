@@ -16,14 +16,14 @@ from nerf.kernels.warp.occupancy import cell_number
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 _BOX = wp.constant(BOX)
-_HALF = wp.constant(CONTRACTED_BOX)
-_LARGEST = wp.constant(1.0e30)
+_CONTRACTED_BOX = wp.constant(CONTRACTED_BOX)
+_MAX_INVERSE = wp.constant(1.0e30)
 
 
 def march(occupied: BinaryOccupancy, stepping: RayStepping, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples:
     """As in nerf.kernels.torch.marching."""
     count, device = len(jitter), jitter.device
-    found = _scratch(count * stepping.max_samples, device)
+    sample_numbers = _scratch(count * stepping.max_samples, device)
     counts = torch.zeros(count + 1, dtype=torch.int32, device=device)
     first = torch.empty(count, device=device)
     far = torch.empty(count, device=device)
@@ -34,12 +34,12 @@ def march(occupied: BinaryOccupancy, stepping: RayStepping, rays: Rays, jitter: 
         stepping.occupancy_resolution,
         stepping.max_samples,
     )
-    launch(_march, count, *occupied, *sizes, *rays, jitter, found, counts, first, far)
+    launch(_march, count, *occupied, *sizes, *rays, jitter, sample_numbers, counts, first, far)
     starts = counts.cumsum(0, dtype=torch.int32)
     total = int(starts[-1])
     ray = torch.empty(total, dtype=torch.int32, device=device)
     t, dt = torch.empty(total, device=device), torch.empty(total, device=device)
-    launch(_place, count, *sizes[:2], stepping.max_samples, found, starts, first, jitter, far, ray, t, dt)
+    launch(_pack, count, *sizes[:2], stepping.max_samples, sample_numbers, starts, first, jitter, far, ray, t, dt)
     return Samples(starts, ray, t, dt)
 
 
@@ -62,11 +62,11 @@ def sample_points_backward(
 
 
 # Memory that a march fills and its own second half reads; kept, as fetching fresh pages takes longer than both.
-_of_thread = threading.local()
+_thread_local = threading.local()
 
 
 def _scratch(length: int, device: torch.device) -> Tensor:
-    scratch: dict[torch.device, Tensor] = vars(_of_thread).setdefault("scratch", {})
+    scratch: dict[torch.device, Tensor] = vars(_thread_local).setdefault("scratch", {})
     kept = scratch.get(device)
     if kept is None or len(kept) < length:
         kept = scratch[device] = torch.empty(length, dtype=torch.int32, device=device)
@@ -74,21 +74,21 @@ def _scratch(length: int, device: torch.device) -> Tensor:
 
 
 @wp.func
-def s_to_t(step: float, cone: float, s: float):
+def s_to_t(step_size: float, cone_angle: float, s: float):
     """t(s) of nerf.kernels.RayStepping."""
-    if cone == 0.0:
-        return step * s
-    beyond = wp.max(cone * s - 1.0, 0.0)
-    return wp.min(step * s, step / cone) * wp.exp(beyond)
+    if cone_angle == 0.0:
+        return step_size * s
+    beyond = wp.max(cone_angle * s - 1.0, 0.0)
+    return wp.min(step_size * s, step_size / cone_angle) * wp.exp(beyond)
 
 
 @wp.func
-def t_to_s(step: float, cone: float, t: float):
+def t_to_s(step_size: float, cone_angle: float, t: float):
     """s(t), the inverse of t(s)."""
-    if cone == 0.0:
-        return t / step
-    until = step / cone
-    return wp.min(t, until) / step + wp.log(wp.max(t, until) / until) / cone
+    if cone_angle == 0.0:
+        return t / step_size
+    until = step_size / cone_angle
+    return wp.min(t, until) / step_size + wp.log(wp.max(t, until) / until) / cone_angle
 
 
 @wp.func
@@ -102,9 +102,9 @@ def _contract(point: wp.vec3):
 
 
 @wp.func
-def _unit(contracted: int, point: wp.vec3):
+def _unit_coordinates(contracted: int, point: wp.vec3):
     if contracted != 0:
-        return (_contract(point) + wp.vec3(_HALF)) / (2.0 * _HALF)
+        return (_contract(point) + wp.vec3(_CONTRACTED_BOX)) / (2.0 * _CONTRACTED_BOX)
     return (point + wp.vec3(_BOX)) / (2.0 * _BOX)
 
 
@@ -121,18 +121,18 @@ def _slab(origin: float, direction: float):
 
 
 @wp.func
-def _box(origin: wp.vec3, direction: wp.vec3):
+def _clip_to_box(origin: wp.vec3, direction: wp.vec3):
     """Where a ray enters the box of a bounded scene, and where it leaves it."""
-    on_x = _slab(origin[0], direction[0])
-    on_y = _slab(origin[1], direction[1])
-    on_z = _slab(origin[2], direction[2])
-    return wp.vec2(wp.max(wp.max(on_x[0], on_y[0]), on_z[0]), wp.min(wp.min(on_x[1], on_y[1]), on_z[1]))
+    x = _slab(origin[0], direction[0])
+    y = _slab(origin[1], direction[1])
+    z = _slab(origin[2], direction[2])
+    return wp.vec2(wp.max(wp.max(x[0], y[0]), z[0]), wp.min(wp.min(x[1], y[1]), z[1]))
 
 
 @wp.func
 def _inverse(contracted: int, direction: wp.vec3):
     """Of how fast unit coordinates move along the ray where they are linear; finite where one stands still."""
-    inverse = wp.cw_div(wp.vec3(wp.where(contracted != 0, 2.0 * _HALF, 2.0 * _BOX)), direction)
+    inverse = wp.cw_div(wp.vec3(wp.where(contracted != 0, 2.0 * _CONTRACTED_BOX, 2.0 * _BOX)), direction)
     return wp.vec3(_finite(inverse[0]), _finite(inverse[1]), _finite(inverse[2]))
 
 
@@ -148,14 +148,12 @@ def _cell(cells: int, u: wp.vec3):
 
 @wp.func
 def _finite(number: float):
-    return wp.where(wp.abs(number) < _LARGEST, number, _LARGEST)
+    return wp.where(wp.abs(number) < _MAX_INVERSE, number, _MAX_INVERSE)
 
 
 @wp.func
-def _free_distance(
-    contracted: int, cells: int, cell: wp.vec3i, clear: int, u: wp.vec3, point: wp.vec3, inverse: wp.vec3
-):
-    """How far along the ray it stays, but for rounding at a face, within the cube of ``2 clear - 1`` bricks per side
+def _empty_span(contracted: int, cells: int, cell: wp.vec3i, empty: int, u: wp.vec3, point: wp.vec3, inverse: wp.vec3):
+    """How far along the ray it stays, but for rounding at a face, within the cube of ``2 empty - 1`` bricks per side
     around a cell, which holds its point (unit: u).
 
     Where unit coordinates are linear, up to where it leaves these bricks or that region. Where space is contracted, r
@@ -164,40 +162,40 @@ def _free_distance(
     component) it stays for max(3/4 m, m r / (4 + m)).
     """
     width = 1.0 / float(cells)
-    around = 4.0 * float(clear - 1)
+    around = 4.0 * float(empty - 1)
     low = (wp.vec3(float(cell[0] & ~3), float(cell[1] & ~3), float(cell[2] & ~3)) - wp.vec3(around)) * width
     high = low + wp.vec3((2.0 * around + 4.0) * width)
-    folded = float(0.0)
+    contracted_span = float(0.0)
     if contracted != 0:
         r = wp.max(wp.abs(point))
-        m = 2.0 * _HALF * wp.min(wp.min(u - low, high - u))
-        folded = wp.max(0.75 * m, m * r / (4.0 + m))
+        m = 2.0 * _CONTRACTED_BOX * wp.min(wp.min(u - low, high - u))
+        contracted_span = wp.max(0.75 * m, m * r / (4.0 + m))
         if r >= 1.0:
-            return folded
+            return contracted_span
         low = wp.max(low, wp.vec3(0.25))  # [-1, 1] of [-2, 2]
         high = wp.min(high, wp.vec3(0.75))
     exits = wp.max(wp.cw_mul(low - u, inverse), wp.cw_mul(high - u, inverse))
-    return wp.max(folded, wp.min(exits))
+    return wp.max(contracted_span, wp.min(exits))
 
 
 @wp.kernel
 def _march(
     bits: wp.array[wp.int64],
     empty_distance: wp.array[wp.uint8],
-    step: float,
-    cone: float,
+    step_size: float,
+    cone_angle: float,
     contracted: int,
     cells: int,
-    most: int,
+    max_samples: int,
     origins: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     nears: wp.array[float],
     fars: wp.array[float],
     jitter: wp.array[float],
-    found: wp.array[int],
+    sample_numbers: wp.array[int],
     counts: wp.array[int],
-    firsts: wp.array[float],
-    ends: wp.array[float],
+    s_near: wp.array[float],
+    far_ends: wp.array[float],
 ):
     ray = wp.tid()
     o = origins[ray]
@@ -205,53 +203,53 @@ def _march(
     near = nears[ray]
     far = fars[ray]
     counts[ray + 1] = 0
-    if near >= far:  # its light is used up
+    if near >= far:  # it has ended
         return
     if contracted == 0:
-        within = _box(o, d)
+        within = _clip_to_box(o, d)
         near = wp.max(near, within[0])
         far = wp.max(near, wp.min(far, within[1]))
-    first = t_to_s(step, cone, near)
-    last = t_to_s(step, cone, far) - first
+    first = t_to_s(step_size, cone_angle, near)
+    last = t_to_s(step_size, cone_angle, far) - first
     count = int(0)
     k = int(0)
     inverse = _inverse(contracted, d)
-    while float(k) < last and count < most:
+    while float(k) < last and count < max_samples:
         s = first + jitter[ray] + float(k)
-        t = s_to_t(step, cone, s)
+        t = s_to_t(step_size, cone_angle, s)
         if t >= far:
             break
         point = o + t * d
-        u = _unit(contracted, point)
+        u = _unit_coordinates(contracted, point)
         cell = _cell(cells, u)
         number = cell_number(cells, cell[0], cell[1], cell[2])
         word = bits[number >> 6]
         if word == wp.int64(0):
-            clear = wp.max(1, int(empty_distance[number >> 6]))
-            free = _free_distance(contracted, cells, cell, clear, u, point, inverse)
+            empty = wp.max(1, int(empty_distance[number >> 6]))
+            span = _empty_span(contracted, cells, cell, empty, u, point, inverse)
             # Rounded down by a thousandth of a step: a step too few is looked at again, one too many is lost.
-            steps = t_to_s(step, cone, t + free) - s - 0.001
+            steps = t_to_s(step_size, cone_angle, t + span) - s - 0.001
             k += wp.max(1, int(wp.min(steps, 1.0e6)) + 1)
         else:
             if ((word >> wp.int64(number & 63)) & wp.int64(1)) != wp.int64(0):
-                found[ray * most + count] = k
+                sample_numbers[ray * max_samples + count] = k
                 count += 1
             k += 1
     counts[ray + 1] = count
-    firsts[ray] = first
-    ends[ray] = far
+    s_near[ray] = first
+    far_ends[ray] = far
 
 
 @wp.kernel
-def _place(
-    step: float,
-    cone: float,
-    most: int,
-    found: wp.array[int],
+def _pack(
+    step_size: float,
+    cone_angle: float,
+    max_samples: int,
+    sample_numbers: wp.array[int],
     starts: wp.array[int],
-    firsts: wp.array[float],
+    s_near: wp.array[float],
     jitter: wp.array[float],
-    ends: wp.array[float],
+    far_ends: wp.array[float],
     rays: wp.array[int],
     distances: wp.array[float],
     lengths: wp.array[float],
@@ -259,12 +257,12 @@ def _place(
     ray = wp.tid()
     start = starts[ray]
     for i in range(start, starts[ray + 1]):
-        k = float(found[ray * most + i - start])
-        here = s_to_t(step, cone, firsts[ray] + k)
-        there = wp.min(s_to_t(step, cone, firsts[ray] + k + 1.0), ends[ray])
+        k = float(sample_numbers[ray * max_samples + i - start])
+        start_t = s_to_t(step_size, cone_angle, s_near[ray] + k)
+        end_t = wp.min(s_to_t(step_size, cone_angle, s_near[ray] + k + 1.0), far_ends[ray])
         rays[i] = ray
-        distances[i] = s_to_t(step, cone, firsts[ray] + jitter[ray] + k)
-        lengths[i] = there - here
+        distances[i] = s_to_t(step_size, cone_angle, s_near[ray] + jitter[ray] + k)
+        lengths[i] = end_t - start_t
 
 
 @wp.kernel
@@ -278,15 +276,15 @@ def _sample_points(
 ):
     i = wp.tid()
     ray = rays[i]
-    points[i] = _unit(contracted, origins[ray] + distances[i] * directions[ray])
+    points[i] = _unit_coordinates(contracted, origins[ray] + distances[i] * directions[ray])
 
 
 @wp.func
-def _unit_backward(contracted: int, point: wp.vec3, grad: wp.vec3):
+def _unit_coordinates_backward(contracted: int, point: wp.vec3, grad: wp.vec3):
     """With r = |x_a| the largest component: y_i = f x_i for f = (2 - 1/r) / r, and df/dr = -2 (r - 1) / r³."""
     if contracted == 0:
         return grad / (2.0 * _BOX)
-    g = grad / (2.0 * _HALF)
+    g = grad / (2.0 * _CONTRACTED_BOX)
     axis = int(0)
     if wp.abs(point[1]) > wp.abs(point[axis]):
         axis = 1
@@ -319,12 +317,12 @@ def _sample_points_backward(
 ):
     ray = wp.tid()
     # In float64: of a ray of 4096 equal gradients a float32 sum loses more than 1e-5.
-    on_origin = wp.vec3d()
-    on_direction = wp.vec3d()
+    grad_origin = wp.vec3d()
+    grad_direction = wp.vec3d()
     for i in range(starts[ray], starts[ray + 1]):
         t = distances[i]
-        grad = _unit_backward(contracted, origins[ray] + t * directions[ray], grad_points[i])
-        on_origin += wp.vec3d(grad)
-        on_direction += wp.vec3d(t * grad)
-    grad_origins[ray] = wp.vec3(on_origin)
-    grad_directions[ray] = wp.vec3(on_direction)
+        grad = _unit_coordinates_backward(contracted, origins[ray] + t * directions[ray], grad_points[i])
+        grad_origin += wp.vec3d(grad)
+        grad_direction += wp.vec3d(t * grad)
+    grad_origins[ray] = wp.vec3(grad_origin)
+    grad_directions[ray] = wp.vec3(grad_direction)

@@ -20,8 +20,8 @@ def scatter_max(
     values: Float[Tensor, "points"],
 ) -> None:
     """As in nerf.kernels.torch.occupancy."""
-    launch(_raise, len(points), cells, optical_thickness, points, values)
-    launch(_spoil, len(points), cells, optical_thickness, points, values)
+    launch(_scatter_max, len(points), cells, optical_thickness, points, values)
+    launch(_propagate_nan, len(points), cells, optical_thickness, points, values)
 
 
 def occupancy_bits(optical_thickness: Float[Tensor, "cells"], threshold: float) -> Int64[Tensor, "bricks"]:
@@ -50,8 +50,8 @@ def cell_of(cells: int, point: wp.vec3):
 
 
 @wp.kernel
-def _raise(cells: int, optical_thickness: wp.array[float], points: wp.array[wp.vec3], values: wp.array[float]):
-    """To the largest number; a maximum of Warp's takes NaN for missing, so a cell that holds one is let be."""
+def _scatter_max(cells: int, optical_thickness: wp.array[float], points: wp.array[wp.vec3], values: wp.array[float]):
+    """Numbers alone: Warp's maximum takes NaN for missing. A cell that is NaN stays so."""
     i = wp.tid()
     cell = cell_of(cells, points[i])
     if optical_thickness[cell] < values[i]:
@@ -59,8 +59,8 @@ def _raise(cells: int, optical_thickness: wp.array[float], points: wp.array[wp.v
 
 
 @wp.kernel
-def _spoil(cells: int, optical_thickness: wp.array[float], points: wp.array[wp.vec3], values: wp.array[float]):
-    """Where a value is no number, nor is the cell's. A launch by itself: on a GPU a maximum might undo it."""
+def _propagate_nan(cells: int, optical_thickness: wp.array[float], points: wp.array[wp.vec3], values: wp.array[float]):
+    """A cell is NaN where one of its values is. A launch by itself: on a GPU a maximum might undo it."""
     i = wp.tid()
     if wp.isnan(values[i]):
         optical_thickness[cell_of(cells, points[i])] = values[i]

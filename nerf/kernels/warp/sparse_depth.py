@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.kernels import RayStepping, Samples
-from nerf.kernels.warp.compositing import apart, grows_from
+from nerf.kernels.warp.compositing import log_from, normalised_difference
 from nerf.kernels.warp.launch import launch
 
 wp.set_module_options({"enable_backward": False})
@@ -23,7 +23,7 @@ def depth_loss(
     """As in nerf.kernels.torch.sparse_depth."""
     loss = torch.zeros_like(distance)
     packed = samples.starts, samples.t, weights
-    launch(_depth_loss, len(distance), grows_from(stepping), *packed, opacity, far, distance, loss)
+    launch(_depth_loss, len(distance), log_from(stepping), *packed, opacity, far, distance, loss)
     return loss
 
 
@@ -35,15 +35,15 @@ def depth_loss_backward(
     grad: Float[Tensor, "rays"],
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "rays"]]:
     """As in nerf.kernels.torch.sparse_depth."""
-    of_weights, of_opacity = torch.zeros_like(samples.t), torch.zeros_like(distance)
+    grad_weights, grad_opacity = torch.zeros_like(samples.t), torch.zeros_like(distance)
     places = samples.starts, samples.t, far, distance
-    launch(_depth_loss_backward, len(distance), grows_from(stepping), *places, grad, of_weights, of_opacity)
-    return of_weights, of_opacity
+    launch(_depth_loss_backward, len(distance), log_from(stepping), *places, grad, grad_weights, grad_opacity)
+    return grad_weights, grad_opacity
 
 
 @wp.kernel
 def _depth_loss(
-    grows_from: float,
+    log_from: float,
     starts: wp.array[int],
     distances: wp.array[float],
     weights: wp.array[float],
@@ -56,27 +56,27 @@ def _depth_loss(
     if distance[ray] == 0.0:
         return
     point = distance[ray]
-    total = wp.float64((1.0 - opacity[ray]) * wp.abs(apart(grows_from, point, far[ray])))
+    total = wp.float64((1.0 - opacity[ray]) * wp.abs(normalised_difference(log_from, point, far[ray])))
     for i in range(starts[ray], starts[ray + 1]):
-        total += wp.float64(weights[i] * wp.abs(apart(grows_from, point, distances[i])))
+        total += wp.float64(weights[i] * wp.abs(normalised_difference(log_from, point, distances[i])))
     loss[ray] = float(total)
 
 
 @wp.kernel
 def _depth_loss_backward(
-    grows_from: float,
+    log_from: float,
     starts: wp.array[int],
     distances: wp.array[float],
     far: wp.array[float],
     distance: wp.array[float],
     grad: wp.array[float],
-    of_weights: wp.array[float],
-    of_opacity: wp.array[float],
+    grad_weights: wp.array[float],
+    grad_opacity: wp.array[float],
 ):
     ray = wp.tid()
     if distance[ray] == 0.0:
         return
     point = distance[ray]
-    of_opacity[ray] = -grad[ray] * wp.abs(apart(grows_from, point, far[ray]))
+    grad_opacity[ray] = -grad[ray] * wp.abs(normalised_difference(log_from, point, far[ray]))
     for i in range(starts[ray], starts[ray + 1]):
-        of_weights[i] = grad[ray] * wp.abs(apart(grows_from, point, distances[i]))
+        grad_weights[i] = grad[ray] * wp.abs(normalised_difference(log_from, point, distances[i]))

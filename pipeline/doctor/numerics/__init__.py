@@ -2,8 +2,8 @@
 
 The cases are data that three readers share: ``tests/numerics`` holds them to their bounds, ``docs/NUMERICS.md`` is
 written from them, and ``pipeline doctor --selftest`` runs them on the user's own device. A new formula gets a case in
-one of the modules beside this one (or in a new one that ``matrix.py`` adds) and thereby a row, a test and a line of the
-self-test.
+one of the modules beside this one (or in a new one that ``matrix.py`` adds) and a description in
+``tests/numerics/descriptions.py``, and thereby a row, a test and a line of the self-test.
 """
 
 from collections.abc import Callable
@@ -27,10 +27,7 @@ class Bound(NamedTuple):
 
 
 class Case(NamedTuple):
-    """A formula, what float32 could do to it, and how to find out.
-
-    ``where``: file and functions. ``domain``: for which inputs it is promised. ``hazard``: where float32 would
-    overflow, underflow or cancel; ``answer``: what the code does there. ``tried``: the inputs in words.
+    """A formula, ``where`` it is (file and functions), and how to find out what float32 does to it.
 
     ``typical`` and ``extreme`` give the inputs, float32 tensors that agree in their first axis, the rows; the first
     ``differentiable`` of them get gradients. ``function`` takes a backend and the inputs, ``reference`` float64 inputs;
@@ -41,10 +38,6 @@ class Case(NamedTuple):
 
     formula: str
     where: str
-    domain: str
-    hazard: str
-    answer: str
-    tried: str
     typical: Callable[[], tuple[Tensor, ...]]
     extreme: Callable[[], tuple[Tensor, ...]]
     function: Callable[..., Tensor]

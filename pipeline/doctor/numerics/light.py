@@ -139,29 +139,18 @@ def _crossing(values: Tensor) -> Tensor:
 
 COMPOSITED: dict[str, Any] = {
     "where": "nerf/rendering/volume_rendering.py: composite, volume_weights",
-    "domain": "σ ≥ 0, ascending t",
-    "hazard": "1 − exp(−τ) loses thin media, 1e30 − 1e30 in Σ_{j<i} τ_j, ∞ · 0 in the gradient of an opaque ray",
-    "answer": "exp of minus a running sum, shifted; expm1; an optical depth of ∞ is exactly opaque, its gradient 0",
-    "tried": "σ over six decades; 0, 1e-45, 1e-38 … 1e30, alone and one behind the other",
     "typical": lambda: _thin_to_solid(1, 256),
     "extreme": _hard_densities,
 }
 
 PACKED: dict[str, Any] = COMPOSITED | {
     "where": "nerf/kernels/torch/compositing.py: composite, composite_backward",
-    "hazard": "as above; differences of running sums over all rays; T g − Σ w g − U G cancels",
-    "answer": "sums in float64 of τ limited to 800, where exp is 0 even there; what is larger or no number is summed "
-    "ray by ray, which Warp always does",
 }
 
 CASES = [
     Case(
         formula="stratified samples, even",
         where="nerf/rendering/sampling.py: stratified",
-        domain="near ≤ far, finite",
-        hazard="far − near cancels for a thin shell far away",
-        answer="lerp: exact at both ends, monotonic",
-        tried="near < 1 < far < 1000; shells of 1e-6, lengths of 0 and 1e30",
         typical=lambda: (uniform(1, 0.05, 1, 256), uniform(2, 1, 1000, 256)),
         extreme=lambda: (torch.tensor([0.0, 1.0, 5.0, 1e-38]), torch.tensor([1e30, 1.000001, 5.0, 1.0])),
         function=_stratified("linear"),
@@ -171,10 +160,6 @@ CASES = [
     Case(
         formula="stratified samples near (far/near)ᵘ",
         where="nerf/rendering/sampling.py: stratified",
-        domain="0 < near ≤ far < 3e38 near",
-        hazard="far/near overflows",
-        answer="not guarded: far/near is below 1e6 in any scene, and the vanilla NeRF takes rays in float64",
-        tried="near < 1 < far < 1000; near = 1e-30 with far = 1, near = far",
         typical=lambda: (uniform(1, 0.05, 1, 256), uniform(2, 1, 1000, 256)),
         extreme=lambda: (torch.tensor([1e-30, 5.0, 1e-4]), torch.tensor([1.0, 5.0, 1e4])),
         function=_stratified("log"),
@@ -184,10 +169,6 @@ CASES = [
     Case(
         formula="edges half-way between samples",
         where="nerf/rendering/sampling.py: midpoint_edges",
-        domain="t < 1.7e38",
-        hazard="the sum of two samples overflows beyond",
-        answer="not guarded: no scene is so large",
-        tried="2 < t < 6, t = 0, t = 1e30",
         typical=lambda: (_ends(torch.zeros(1)).repeat(64, 1) * decades(1, -2, 2, 64, 1), torch.zeros(64)),
         extreme=lambda: (torch.tensor([0.0, 1e-30, 1e30])[:, None].repeat(1, N + 1), torch.zeros(3)),
         function=lambda _, t, near: midpoint_edges(t, near),
@@ -197,10 +178,6 @@ CASES = [
     Case(
         formula="inverse CDF: CDF(t(u)) = u",
         where="nerf/rendering/sampling.py: invert_cdf",
-        domain="weights ≥ 0 whose sum is below 3e38; below 1e-37 t is in the right bin, coarse within",
-        hazard="0/0 for a ray without weight and in empty bins; u = 1 beyond the last bin; thin bins beside dense ones",
-        answer="u is scaled to the sum, not the weights by it, and kept below it: bisection never ends in an empty bin",
-        tried="weights over six decades; none, equal, spikes of 1e-37 to 1e30 in every bin; u from 0 to 1",
         typical=lambda: (
             _ends(torch.zeros(1)).repeat(256, 1),
             decades(1, -6, 0, 256, N),
@@ -223,10 +200,6 @@ CASES = [
     Case(
         formula="opacity of thin media",
         where="nerf/rendering/volume_rendering.py: volume_weights",
-        domain="σ ≥ 0",
-        hazard="1 − exp(−τ) is 0 for τ < 6e-8, and has one digit at 1e-6",
-        answer="expm1; autograd takes its slope as 1 + expm1(−τ), which is off by 6e-8 at any transmittance",
-        tried="one interval, τ from 0 and 1e-38 to 10",
         typical=lambda: (decades(1, -30, 1, 512, 1),),
         extreme=lambda: (torch.tensor([[0.0], [1e-45], [1e-38], [1e-7], [1.0], [1e30]]),),
         function=lambda _, sigma: volume_weights(sigma, torch.tensor([1.0, 2.0]).to(sigma).repeat(len(sigma), 1))[0],
@@ -249,10 +222,6 @@ CASES = [
     Case(
         formula="occupancy 1 − 2^(−σ/level)",
         where="nerf/fields/density_grid.py: occupancy",
-        domain="σ ≥ 0, level > 0",
-        hazard="linear interpolation of σ puts a sharp surface beside the empty vertex; 1 − 2^(−x) loses thin media",
-        answer="expm1: bounded by 1, relative precision down to denormal densities",
-        tried="σ from 0, 1e-38 to 1e30",
         typical=lambda: (decades(1, -6, 3, 512, 1),),
         extreme=lambda: (torch.tensor([[0.0], [1e-38], [1e-30], [7.0], [1e4], [1e30]]),),
         function=_occupied,
@@ -262,10 +231,6 @@ CASES = [
     Case(
         formula="optical depth by trapezoids",
         where="nerf/fields/density_grid.py: optical_depth",
-        domain="σ < 1.7e38",
-        hazard="the sum of two densities overflows beyond",
-        answer="not guarded: densities are at most e¹⁵",
-        tried="σ over six decades; 0, 1e-45 … 1e30, alone and one behind the other",
         typical=lambda: (decades(1, -4, 2, 256, N),),
         extreme=lambda: _hard_densities()[:1],
         function=lambda _, sigma: optical_depth(sigma, _ends(sigma)[:-1].expand_as(sigma)),
@@ -277,10 +242,6 @@ CASES = [
     Case(
         formula="first crossing of a level",
         where="nerf/fields/density_grid.py: first_crossing",
-        domain="values < 3e38",
-        hazard="(level − v₀)/(v₁ − v₀) is 0/0 on a plateau",
-        answer="divides only where v₁ > v₀; infinite where the level is not reached",
-        tried="values around the level; steps from 0 to 1e30, onto the level exactly",
         typical=lambda: (torch.cat([uniform(1, 0, 0.4, 256, 1), uniform(2, 0.5, 9, 256, 1)], -1),),
         extreme=lambda: (torch.tensor([[0.0, 1e30], [0.49999997, 0.5], [0.5, 0.5], [1e30, 1e30], [1e-45, 0.5]]),),
         function=lambda _, values: first_crossing(values, torch.tensor([2.0, 2.125]).to(values).expand_as(values), 0.5)[

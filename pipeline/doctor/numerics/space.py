@@ -188,10 +188,6 @@ CASES = [
     Case(
         formula="γ(x) = sin, cos of 2ᵏπx, k < 16",
         where="nerf/fields/positional_encoding.py: positional_encoding",
-        domain="|x| ≤ 1e30",
-        hazard="float32 of 2⁹πx is off by 1e-4 for |x| < 1, by all of it beyond 1e4",
-        answer="2ᵏx is reduced to half a turn, exactly in binary, before it is multiplied by π",
-        tried="|x| < 0.9; 0, 1e-45, 1e-38, ±1/2, ±1, up to 1e3, 1e6, 1e30",
         typical=lambda: (uniform(1, -0.9, 0.9, 512, 3),),
         extreme=lambda: (
             torch.cat(
@@ -211,10 +207,6 @@ CASES = [
     Case(
         formula="contraction (2 − 1/r) x/r",
         where="nerf/geometry/contraction.py: contract",
-        domain="all finite x",
-        hazard="r² overflows beyond 1e19; the slope jumps where r = max abs x_i has ties",
-        answer="x/r and 1/r only, r ≥ 1; the identity for r ≤ 1, with a continuous slope at 1",
-        tried="|x| < 3; 0, 1e-45, 1 and its neighbours, ties, 1e19, 1e30, 3e38",
         typical=lambda: (uniform(1, -3, 3, 512, 3),),
         extreme=lambda: (
             torch.tensor(
@@ -239,10 +231,6 @@ CASES = [
     Case(
         formula="its inverse y / (m (2 − m))",
         where="nerf/geometry/contraction.py: uncontract",
-        domain="max abs y_i < 2",
-        hazard="2 − m cancels; infinite at 2",
-        answer="2 − m of two float32 numbers is exact (Sterbenz); callers stay half a cell within the faces",
-        tried="|y| < 1.9; 0, 1 and its neighbours, the last number below 2",
         typical=lambda: (uniform(1, -1.9, 1.9, 512, 3),),
         extreme=lambda: (
             torch.tensor([[0.0, 1e-45, -0.0], [1.0, -1.0, 0.5], [1.0000001, 0.1, 0.0], [1.9999999, 1.0, -1e-30]]),
@@ -256,10 +244,6 @@ CASES = [
     Case(
         formula="normalised device coordinates (x/z, y/z, 1 − 2 n/z)",
         where="nerf/geometry/space_maps.py: forward, pull_back",
-        domain="all finite points",
-        hazard="infinite at z = 0, folded back behind it",
-        answer="z is n/1000 at least: what is before the near plane or behind the camera is far outside of the cube",
-        tried="|x| < 3; at infinity, on the near plane, beside and behind the camera",
         typical=lambda: (torch.tensor(NDC.apex) + uniform(1, -0.5, 3, 512, 3) @ torch.tensor(NDC.axes),),
         extreme=lambda: (
             torch.tensor(NDC.apex)
@@ -276,10 +260,6 @@ CASES = [
     Case(
         formula="their inverse, z = 2 n / (1 − z')",
         where="nerf/geometry/space_maps.py: inverse",
-        domain="max abs y_i < 0.9",
-        hazard="1 − z' cancels; infinite at the far face",
-        answer="1 − z' of two float32 numbers is exact near the far face; callers stay half a cell within it",
-        tried="|y| < 0.89; the middle, the near face, half a cell of 128 within the far face",
         typical=lambda: (uniform(1, -0.89, 0.89, 512, 3),),
         extreme=lambda: (torch.tensor([[0.0, 0.0, 0.0], [0.1, -0.2, -0.9], [0.5, 0.9, 0.893]]),),
         function=lambda _, y: NDC.inverse(y),
@@ -291,10 +271,6 @@ CASES = [
     Case(
         formula="straight rays through them",
         where="nerf/geometry/space_maps.py: map_rays, from_scene",
-        domain="rays that come before the near plane",
-        hazard="the paper's z/(z + t) − 1 cancels far away; 0/0 for rays parallel to the image plane",
-        answer="distances over depth, t / z(t): finite in every direction",
-        tried="directions up to 45° off the axis, distances of 2.5 to 100; parallel, from far behind, backward, to 1e6",
         typical=_ndc_rays,
         extreme=_hard_ndc_rays,
         function=_on_mapped_rays,
@@ -304,10 +280,6 @@ CASES = [
     Case(
         formula="o + t d",
         where="nerf/geometry/rays.py: points_on",
-        domain="finite",
-        hazard="cancels where o and t d are long and their sum is short: a camera 1e6 units off sees 0.06 units coarse",
-        answer="the scene frame has its region in ±0.9, wherever sfm had it; the vanilla NeRF takes rays in float64",
-        tried="|o| < 3, t < 30; t from 0 and 1e-45 to 1e30",
         typical=_spread_rays,
         extreme=_far_rays,
         function=_points_on,
@@ -319,10 +291,6 @@ CASES = [
     Case(
         formula="unit coordinates of samples, bounded",
         where="nerf/kernels/torch/marching.py: sample_points, sample_points_backward",
-        domain="points of a ray clipped to the box",
-        hazard="o + t d cancels as above",
-        answer="errors of a float32 point; gradients are sums over a ray's samples, in order, by Warp in float64",
-        tried="|o| < 3, t < 30; t from 0 to 1e-45 … 2",
         typical=_spread_rays,
         extreme=lambda: tuple(part[:8] for part in _far_rays()),
         value=Bound(1e-6, "row"),
@@ -332,10 +300,6 @@ CASES = [
     Case(
         formula="unit coordinates of samples, contracted",
         where="nerf/kernels/torch/marching.py: sample_points, sample_points_backward",
-        domain="all finite points",
-        hazard="r³ overflows beyond 1e12 in the gradient −2 (r − 1)/r³",
-        answer="written in x/r and 1/r",
-        tried="|o| < 3, t < 30; t from 0 and 1e-45 to 1e30",
         typical=_spread_rays,
         extreme=_far_rays,
         value=Bound(5e-7, "one"),
@@ -345,10 +309,6 @@ CASES = [
     Case(
         formula="ray–box interval by slabs",
         where="nerf/geometry/rays.py: clip_to_box",
-        domain="finite rays that do not run within a face",
-        hazard="0/0 for a ray within a face, (±h − o)/0 along an axis",
-        answer="a component of 0 becomes the smallest normal number; a ray within a face may count either way, finite",
-        tried="|o| < 2; along axes (±0, 1e-45, 1e-38), from inside, from 1000 and 1e6 away, misses, far = 1e30",
         typical=_box_rays,
         extreme=_hard_box_rays,
         function=lambda _, o, d, e: torch.stack(clip_to_box(Rays(o, d, *e.unbind(-1)), -BOX, BOX)[2:], -1),
@@ -358,10 +318,6 @@ CASES = [
     Case(
         formula="t(s) = step s, then step/cone exp(cone s − 1)",
         where="nerf/kernels/torch/marching.py: s_to_t",
-        domain="t ≤ 1e30",
-        hazard="exp overflows for s beyond 89/cone",
-        answer="the exponent's own rounding, cone s ulp/2, stays: 1e-6 at t = 1000; infinite t is beyond any far",
-        tried="s from 0, 1e-45 to 9000 (t = 1e30)",
         typical=lambda: (uniform(1, 0, 1500, 512, 1),),
         extreme=lambda: (torch.tensor([[0.0], [1e-45], [1e-30], [125.0], [125.00001], [8000.0], [9000.0]]),),
         function=lambda _, s: s_to_t(FOLDED, s),
@@ -371,10 +327,6 @@ CASES = [
     Case(
         formula="s(t), its inverse",
         where="nerf/kernels/torch/marching.py: t_to_s",
-        domain="0 ≤ t ≤ 1e37",
-        hazard="log of 0; t/t₁ overflows beyond 3e38 t₁",
-        answer="the logarithm is taken of max(1, t/t₁)",
-        tried="t from 0, 1e-45 to 1e37",
         typical=lambda: (decades(1, -3, 3, 512, 1),),
         extreme=lambda: (torch.tensor([[0.0], [1e-45], [1e-30], [0.25], [0.25000003], [1e30], [1e37]]),),
         function=lambda _, t: t_to_s(FOLDED, t),
@@ -384,10 +336,6 @@ CASES = [
     Case(
         formula="dt = t(s + 1) − t(s)",
         where="nerf/kernels/torch/marching.py: march",
-        domain="s ≤ 1200 (t ≤ 1200)",
-        hazard="a difference of distances: cancels",
-        answer="its error is a share of t, not of dt = 0.008 t: 1e-4 of an interval at most, in length, not in place",
-        tried="s from 0 to 1200",
         typical=lambda: (uniform(1, 0, 1200, 512),),
         extreme=lambda: (torch.tensor([0.0, 124.0, 124.5, 125.0, 1200.0]),),
         function=_intervals,

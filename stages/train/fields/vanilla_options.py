@@ -4,7 +4,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from stages.contract import Options
+from stages.contract import Auto, Options
 
 
 class VanillaOptions(Options):
@@ -13,23 +13,31 @@ class VanillaOptions(Options):
     tells_ray_gradients: ClassVar[bool] = False
     predicts_gains: ClassVar[bool] = False  # its learning rate falls all the way
 
-    batch_rays: int | None = Field(default=None, ge=1, description="rays in a step (default: from the preset)")
-    depth: int | None = Field(default=None, ge=1, description="layers before the density (default: from the preset)")
-    width: int | None = Field(default=None, ge=2, description="units of each layer (default: from the preset)")
-    skip: int | None = Field(
-        default=None, ge=0, description="index of the layer after which the position enters again (default: 4)"
+    batch_rays: Auto[int] = Field(default=None, ge=1, description="Rays per step (default: from the preset).")
+    depth: Auto[int] = Field(default=None, ge=1, description="Layers before the density (default: from the preset).")
+    width: Auto[int] = Field(default=None, ge=2, description="Units per layer (default: from the preset).")
+    skip: Auto[int] = Field(
+        default=None,
+        ge=0,
+        description="Index of the layer after which the position is concatenated again (default: 4).",
     )
-    position_frequencies: int = Field(default=10, ge=1, description="L of the positional encoding of the position")
-    direction_frequencies: int = Field(default=4, ge=1, description="L of the positional encoding of the direction")
-    samples_coarse: int | None = Field(
-        default=None, ge=2, description="on each ray, for the coarse network (default: from the preset)"
+    position_frequencies: int = Field(
+        default=10, ge=1, description="Frequencies L of the positional encoding of the position."
     )
-    samples_fine: int | None = Field(
-        default=None, ge=1, description="on each ray, placed by the coarse network's weights (default: from the preset)"
+    direction_frequencies: int = Field(
+        default=4, ge=1, description="Frequencies L of the positional encoding of the direction."
     )
-    positional_encoding: bool = Field(default=True, description="lift coordinates to sines and cosines")
-    hierarchical: bool = Field(default=True, description="place fine samples by a coarse network")
-    density_activation: Literal["softplus", "relu"] = Field(default="softplus", description="relu is as published")
-    spacing: Literal["linear", "log"] | None = Field(
-        default=None, description="of coarse samples (default: log in contracted space)"
+    samples_coarse: Auto[int] = Field(
+        default=None, ge=2, description="Samples per ray of the coarse network (default: from the preset)."
+    )
+    samples_fine: Auto[int] = Field(
+        default=None, ge=1, description="Additional samples per ray of the fine network (default: from the preset)."
+    )
+    positional_encoding: bool = Field(default=True, description="Apply the positional encoding.")
+    hierarchical: bool = Field(default=True, description="Sample hierarchically, with a coarse and a fine network.")
+    density_activation: Literal["softplus", "relu"] = Field(
+        default="softplus", description="Activation of the density; relu is the published one."
+    )
+    spacing: Auto[Literal["linear", "log"]] = Field(
+        default=None, description="Spacing of the coarse samples (default: log in contracted space, else linear)."
     )

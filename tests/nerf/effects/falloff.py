@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerf.effects import HeldOutImages, Images
 from nerf.effects.exposure import expose, expose_backward
-from nerf.effects.statistics.statistic import Evidence, classify
+from nerf.effects.statistics.statistic import Statistic, classify
 from nerf.geometry.rays import Rays
 
 
@@ -71,6 +71,6 @@ class FalloffModel:
         return cosine**-2 - 1
 
 
-def statistic(seen: object) -> Evidence:
+def statistic(seen: object) -> Statistic:
     """What a scene says of it: always enough."""
     return classify(1.0, 0.1, 0.5, "EV", "photos are darker at their corners")

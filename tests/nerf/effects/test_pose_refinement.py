@@ -125,8 +125,8 @@ def refined(scale: float) -> tuple[PoseRefinement, float]:
     for step in range(150):
         noise = 5e-3 * torch.randn(480, 3, generator=random)
         moved = poses.forward(given, view).each(lambda part: part.detach().requires_grad_())
-        of_origins, encode_directions = torch.autograd.grad(off(moved, noise).square().mean(), moved[:2])
-        gradients = poses.backward(given, view, RayGradients(of_origins, encode_directions))
+        grad_origins, grad_directions = torch.autograd.grad(off(moved, noise).square().mean(), moved[:2])
+        gradients = poses.backward(given, view, RayGradients(grad_origins, grad_directions))
         for name, gradient in gradients.items():
             mean, square = moments[0][name], moments[1][name]
             reference.adam(poses.parameters[name], gradient, mean, square, LEARNING_RATE, step + 1)

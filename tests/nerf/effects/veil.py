@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.effects import HeldOutImages, Images
-from nerf.effects.statistics.statistic import Evidence, classify
+from nerf.effects.statistics.statistic import Statistic, classify
 from nerf.geometry.rays import Rays
 
 
@@ -59,6 +59,6 @@ class VeilModel:
         return grad, {"level": torch.zeros_like(self.level).index_add_(0, view, grad.sum(1, keepdim=True))}
 
 
-def statistic(seen: object) -> Evidence:
+def statistic(seen: object) -> Statistic:
     """What a scene says of it: always enough."""
     return classify(1.0, 0.1, 0.5, "of white", "photos are veiled")

@@ -1,20 +1,29 @@
 """Options from a file, effects by name on the command line, and workspaces that would lie among the photos or are
 those of other photos."""
 
+import json
 from pathlib import Path
 
 import pytest
+import tyro
 from PIL import Image
 
-from pipeline.cli.arguments import RunArguments, StageArguments, parse
+from pipeline.cli.arguments import COMMANDS, StageArguments, parse, with_flags
 from pipeline.cli.commands import run_command
 from pipeline.cli.options import UsageError, read_toml, with_effects
 from pipeline.engine.settings import Settings
 from stages.effects import Config
 from stages.render import Config as RenderConfig
 from stages.train import Config as TrainConfig
+from stages.train.fields.hash_grid_options import HashGridOptions
 
 EFFECTS = "background, exposure, pose_refinement, view_dependence"
+
+
+def over(remembered: Settings, command: str, words: list[str]) -> Settings:
+    """What a command asks for over the options that a workspace or a file remembers."""
+    kind = COMMANDS.get(command, StageArguments)
+    return with_flags(remembered, parse(kind, command, words).settings, command, words)
 
 
 def test_effects_are_options_of_their_stage():
@@ -61,7 +70,7 @@ def test_wrong_effects_are_named_with_those_that_there_are(choice: str, words: s
 )
 def test_the_budget_given_replaces_the_one_remembered(words: list[str], budget: tuple[str, int | None, float | None]):
     remembered = Settings(train=TrainConfig(preset="high", seconds=600, after="0/0", more_steps=5))
-    train = parse(StageArguments, "train", ["w", *words], remembered).settings.train
+    train = over(remembered, "train", ["w", *words]).train
     assert (train.preset, train.steps, train.seconds) == budget
     assert (train.after is None) == (bool(words) and "None" not in words), "a new training does not go on from another"
 
@@ -82,8 +91,7 @@ def test_the_budget_given_replaces_the_one_remembered(words: list[str], budget: 
     ],
 )
 def test_the_field_given_takes_back_the_options_of_the_other(remembered: dict, words: list[str], left: dict):
-    asked = parse(StageArguments, "train", ["w", *words], Settings(train=TrainConfig(**remembered)))
-    assert asked.settings.train == TrainConfig(**left)
+    assert over(Settings(train=TrainConfig(**remembered)), "train", ["w", *words]).train == TrainConfig(**left)
 
 
 @pytest.mark.parametrize(
@@ -98,13 +106,52 @@ def test_the_field_given_takes_back_the_options_of_the_other(remembered: dict, w
     ],
 )
 def test_a_given_path_or_camera_file_replaces_the_remembered(remembered: dict, words: list[str], left: dict):
-    asked = parse(StageArguments, "render", ["w", *words], Settings(render=RenderConfig(**remembered)))
-    assert asked.settings.render == RenderConfig(**left)
+    assert over(Settings(render=RenderConfig(**remembered)), "render", ["w", *words]).render == RenderConfig(**left)
 
 
 def test_known_cameras_of_the_photos_leave_a_path_to_render():
     in_file = Settings(render=RenderConfig(path="spiral"))
-    assert parse(RunArguments, "run", ["photos", "--cameras", "my.json"], in_file).settings == in_file
+    assert over(in_file, "run", ["photos", "--cameras", "my.json"]) == in_file
+
+
+@pytest.mark.parametrize(
+    ("words", "train"),
+    [
+        (["--train.seed", "3"], {"seed": 3}),
+        (["--train.seed=3", "--train.grid.max-res", "64"], {"seed": 3, "grid": {"num_levels": 3, "max_res": 64}}),
+        (["--train.target_psnr", "25"], {"target_psnr": 25}),
+        (["--target-psnr", "25"], {"target_psnr": 25}),
+        (["--train.no-tensorboard"], {"tensorboard": False}),
+        (["--train.downscale", "None"], {"downscale": None}),
+    ],
+)
+def test_flags_win_over_what_is_remembered(words: list[str], train: dict):
+    remembered = {"seed": 1, "downscale": 4.0, "tensorboard": True, "grid": {"num_levels": 3}}
+    asked = over(Settings(train=TrainConfig.model_validate(remembered)), "train", ["w", *words])
+    assert asked == Settings(train=TrainConfig.model_validate(remembered | train))
+
+
+def test_flags_that_contradict_what_is_remembered_are_refused():
+    remembered = Settings(train=TrainConfig(grid=HashGridOptions(num_levels=3)))
+    with pytest.raises(UsageError) as error:
+        over(remembered, "train", ["w", "--train.vanilla.width", "64"])
+    words = "--train.vanilla.width has no effect with --train.grid.num-levels; leave out one of the two"
+    assert str(error.value) == f"{words} (pipeline train --help)"
+
+
+@pytest.mark.parametrize(
+    "words", [["run", "photos", "--config", "a.toml"], ["run", "photos", "--more", "3steps"], ["train", "photos.nerf"]]
+)
+def test_a_command_line_is_parsed_once(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    parsed: list[list[str]] = []
+    whole = tyro.cli
+    monkeypatch.setattr(tyro, "cli", lambda *given, **more: parsed.append(more["args"]) or whole(*given, **more))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.toml").write_text("[train]\nsteps = 3\n")
+    (tmp_path / "photos.nerf").mkdir()
+    (tmp_path / "photos.nerf/run.json").write_text(json.dumps({"version": 2}))
+    assert run_command(words) != 0
+    assert parsed == [words[1:]]
 
 
 def test_a_file_may_begin_with_a_byte_order_mark(tmp_path: Path):

@@ -11,7 +11,9 @@ import torch
 from nerf.effects.appearance import AppearanceModel
 from nerf.effects.exposure import ExposureModel
 from pipeline.cli.options import Settings, with_effects
+from pipeline.engine.display import SilentDisplay
 from stages import effects, evaluate, render, train
+from stages.contract import run_stage
 from stages.effects.effect_list import EFFECTS, Effect, EffectParts
 from stages.effects.image_effects import photo_effects
 from stages.io.field_files import load_field
@@ -23,7 +25,6 @@ from stages.train.fields.hash_grid_options import HashGridOptions
 from tests.effect_scenes import Effects, effect_scene
 from tests.nerf.effects import veil
 from tests.nerf.effects.veil import VeilModel
-from tests.synthetic_photos import Quiet
 
 ENTRY = Effect("veil", "stray light lies over photos", lambda: EffectParts(veil.statistic, colours=VeilModel))
 
@@ -43,9 +44,9 @@ def trained(listed: None, tmp_path: Path) -> dict[str, Path]:
     for name in ("effects", "train", "evaluate", "render"):
         inputs[name].mkdir()
     decide = with_effects(Settings(), ["veil=on", "exposure=on"]).effects.model_copy(update={"pilots": 0})
-    effects.run(decide, inputs, inputs["effects"], Quiet())
+    run_stage(effects, decide, inputs, inputs["effects"], SilentDisplay())
     grid = HashGridOptions(num_levels=2, log2_hashmap_size=8, max_res=16, target_samples=512)
-    train.run(train.Config(downscale=8.0, steps=5, grid=grid), inputs, inputs["train"], Quiet())
+    run_stage(train, train.Config(downscale=8.0, steps=5, grid=grid), inputs, inputs["train"], SilentDisplay())
     return inputs
 
 
@@ -78,20 +79,22 @@ def test_photos_are_rendered_and_scored_through_a_new_effect(trained: dict[str, 
     _, level = photo_effects(field, scene, test)
     assert 0 < float(level.rows) <= 0.25, "a test photo is veiled as its neighbours are"
     chosen = evaluate.Config(downscale=8.0)
-    evaluate.run(chosen, trained, trained["evaluate"], Quiet())
+    run_stage(evaluate, chosen, trained, trained["evaluate"], SilentDisplay())
     metrics = read_json(trained["evaluate"] / "metrics.json")
     assert metrics["appearance"] == [ExposureModel.held_out_words, VeilModel.held_out_words]
     without = {**field, "effects": {"exposure": field["effects"]["exposure"]}}
     file.write_text(json.dumps(without))
     (trained["evaluate"].parent / "plain").mkdir()
-    evaluate.run(chosen, trained, trained["evaluate"].parent / "plain", Quiet())
+    run_stage(evaluate, chosen, trained, trained["evaluate"].parent / "plain", SilentDisplay())
     assert read_json(trained["evaluate"].parent / "plain" / "metrics.json")["psnr"] != metrics["psnr"]
 
     file.write_text(json.dumps(field))
     like = scene.of_split("train")[3].name
-    rendered = render.run(render.Config(frames=2, width=32, match_exposure=like), trained, trained["render"], Quiet())
+    rendered = run_stage(
+        render, render.Config(frames=2, width=32, match_exposure=like), trained, trained["render"], SilentDisplay()
+    )
     assert rendered.facts["appearance"] == f"exposed like {like}"
-    as_photo, _ = with_appearance(load_renderer(trained["train"]), like, trained["train"], scene, Quiet())
+    as_photo, _ = with_appearance(load_renderer(trained["train"]), like, trained["train"], scene, SilentDisplay())
     assert isinstance(as_photo.model, AppearanceModel)
     assert torch.equal(as_photo.model.effects[1].rows, torch.tensor([[0.25]]))
 

@@ -6,25 +6,26 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from nerf.effects.statistics.statistic import Evidence
+from nerf.effects.statistics.statistic import Statistic
 from nerf.training.trainer import NonFinite
 from pipeline.engine import manifests
+from pipeline.engine.display import SilentDisplay
 from pipeline.engine.keys import stage_key
 from stages import effects, train
+from stages.contract import run_stage
 from stages.effects import pilots, study
 from stages.effects.decisions import Decisions, read_decisions, write_decisions
 from stages.effects.pilots import Pilot
-from stages.effects.study import SceneEvidence
+from stages.effects.study import SceneStatistics
 from stages.io.files import write_json
 from tests.effect_scenes import Effects, effect_scene
 from tests.stages.photo_scene import photographed
-from tests.synthetic_photos import Quiet
 
 CLEAR = {"exposure": False, "view_dependence": True, "background": True, "pose_refinement": False, "vignetting": True}
 
 
-def found(called_for: bool | None, noise: float = 0.1) -> Evidence:
-    return Evidence(1.0, "EV", 2.0, noise, called_for, "one of two")
+def found(called_for: bool | None, noise: float = 0.1) -> Statistic:
+    return Statistic(1.0, "EV", 2.0, noise, called_for, "one of two")
 
 
 @pytest.fixture
@@ -39,12 +40,12 @@ def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
     monkeypatch.setattr(study, "time", SimpleNamespace(perf_counter=lambda: now[0]))
 
     def run(
-        config: effects.Config, gain: float = 1.0, pilot: Callable | None = None, **given: Evidence
+        config: effects.Config, gain: float = 1.0, pilot: Callable | None = None, **given: Statistic
     ) -> tuple[Decisions, dict, str, list[str]]:
         told = {name: found(value) for name, value in CLEAR.items()} | given
         measured = {"exposure": np.full((count, 3), 0.5)}
         took = {name: 0.25 if name == "exposure" else 0.5 for name in told}
-        monkeypatch.setattr(study, "scene_evidence", lambda *_: SceneEvidence(told, measured, took))
+        monkeypatch.setattr(study, "scene_statistics", lambda *_: SceneStatistics(told, measured, took))
         tried: list[str] = []
 
         def run_pilot(_trial: object, off: Decisions, on: Decisions, *_rest: object) -> Pilot:
@@ -55,7 +56,7 @@ def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
         monkeypatch.setattr(pilots, "run_pilot", pilot or run_pilot)
         folder = tmp_path / f"effects{len(list(tmp_path.iterdir()))}"
         folder.mkdir()
-        result = effects.run(config, inputs, folder, Quiet())
+        result = run_stage(effects, config, inputs, folder, SilentDisplay())
         table = json.loads((folder / "effects.json").read_text("utf-8"))
         return read_decisions(folder), table, result.line, tried
 
@@ -191,7 +192,7 @@ def test_real_evidence_of_a_synthetic_scene(tmp_path: Path, made: Effects, on: s
     inputs = effect_scene(tmp_path / "scene", made)
     folder = tmp_path / "effects"
     folder.mkdir()
-    effects.run(effects.Config(pilot_steps=0), inputs, folder, Quiet())
+    run_stage(effects, effects.Config(pilot_steps=0), inputs, folder, SilentDisplay())
     table = json.loads((folder / "effects.json").read_text("utf-8"))
     found = {name for name, entry in table.items() if entry["on"] and entry["modelled"]}
     assert found == on

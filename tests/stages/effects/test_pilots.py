@@ -9,6 +9,7 @@ import torch
 from nerf.effects.exposure import expose
 from nerf.effects.pose_refinement import PoseRefinement, fit_pose
 from nerf.rendering.images import render_image
+from pipeline.engine.display import SilentDisplay
 from stages.effects import pilots
 from stages.effects.decisions import Decisions
 from stages.effects.image_effects import held_out_images, photo_effects
@@ -17,7 +18,6 @@ from stages.io.files import read_scene
 from stages.io.pixels import load_pixels
 from tests.effect_scenes import Effects, effect_scene
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
-from tests.synthetic_photos import Quiet
 
 PLAIN = Decisions({"view_dependence": {}})
 REFINED = PLAIN.having("pose_refinement")
@@ -30,7 +30,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def trial(inputs: dict[str, Path]) -> PilotScene:
-    made = pilot_scene(inputs, read_scene(inputs["normalise"]), Quiet())
+    made = pilot_scene(inputs, read_scene(inputs["normalise"]), SilentDisplay())
     assert not isinstance(made, str), made
     return made
 
@@ -43,14 +43,14 @@ def test_photos_are_kept_back_from_the_training_photos_alone(trial: PilotScene, 
 
 
 def test_equal_arms_gain_exactly_nothing(trial: PilotScene) -> None:
-    pilot = run_pilot(trial, PLAIN, PLAIN, 3, 0, Quiet())
+    pilot = run_pilot(trial, PLAIN, PLAIN, 3, 0, SilentDisplay())
     assert (pilot.gain_db, pilot.noise_db, pilot.pays) == (0.0, 0.0, False)
 
 
 def test_a_wrong_exposure_loses(trial: PilotScene) -> None:
     names = [view.name for view in trial.scene.of_split("train")]
     wrong = PLAIN.having("exposure", {name: [3.0 * (i % 2)] * 3 for i, name in enumerate(names)})
-    pilot = run_pilot(trial, wrong, PLAIN, 40, 0, Quiet())
+    pilot = run_pilot(trial, wrong, PLAIN, 40, 0, SilentDisplay())
     assert 0.5 < pilot.gain_db < 30 and pilot.pays
 
 
@@ -73,7 +73,7 @@ def test_validation_poses_are_fitted_wherever_poses_are_refined(
 
     monkeypatch.setattr(pilots, "_trained", lambda *_: None)
     monkeypatch.setattr(pilots, "_score", score)
-    run_pilot(trial, off, on, 1, 0, Quiet())
+    run_pilot(trial, off, on, 1, 0, SilentDisplay())
     assert asked == [fitted] * (2 * pilots.SEEDS * len(trial.kept))
 
 
@@ -97,7 +97,7 @@ def test_too_few_photos_make_no_pilot(tmp_path: Path) -> None:
     made = {}
     for views in (5, 8, 10):
         inputs, scene = photographed(tmp_path / str(views), views=views)
-        made[len(scene.of_split("train"))] = pilot_scene(inputs, scene, Quiet())
+        made[len(scene.of_split("train"))] = pilot_scene(inputs, scene, SilentDisplay())
     assert made[3] == made[6] == "too few training photos"
     assert isinstance(made[7], PilotScene) and len(made[7].kept) == 3
 
@@ -117,7 +117,7 @@ def test_heavily_masked_photos_make_no_pilot(
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[left] = 255
     inputs, scene = photographed(tmp_path, views=10, mask=mask)
-    assert pilot_scene(inputs, scene, Quiet()) == why
+    assert pilot_scene(inputs, scene, SilentDisplay()) == why
 
 
 @pytest.mark.parametrize(

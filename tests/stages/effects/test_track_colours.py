@@ -10,8 +10,8 @@ from PIL import Image
 import stages.effects.track_colours
 from nerf.effects.statistics.exposure import EV, fit_exposure
 from nerf.geometry.scene import Camera, Scene, Similarity, View
-from stages.effects.evidence import training_residuals
-from stages.effects.study import scene_evidence
+from stages.effects.scene_statistics import training_residuals
+from stages.effects.study import scene_statistics
 from stages.effects.track_colours import (
     BRIGHTEST,
     CLIPPED_SHARE,
@@ -20,7 +20,7 @@ from stages.effects.track_colours import (
     _expected,
     _window_means,
     _windows,
-    look_at_photos,
+    sample_photos,
     training_tracks,
 )
 from stages.io.files import write_png
@@ -92,7 +92,7 @@ def without_points(points: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def test_colours_are_those_of_the_photos(tmp_path: Path, progress: SilentProgress) -> None:
     scene, points = photographed_points(tmp_path)
-    tracks = look_at_photos(tmp_path, scene, points, progress).tracks
+    tracks = sample_photos(tmp_path, scene, points, progress).tracks
     assert len(tracks) > 60 and tracks.views == VIEWS - len(TEST_VIEWS)
     np.testing.assert_allclose(tracks.colour, value(0)[tracks.point] / 255, atol=1e-9)
     assert not tracks.saturated.any()
@@ -117,7 +117,7 @@ def test_test_photos_are_not_opened(tmp_path: Path, progress: SilentProgress) ->
     scene, points = photographed_points(tmp_path)
     for number in TEST_VIEWS:
         (tmp_path / f"images/{number}.png").unlink()
-    assert len(look_at_photos(tmp_path, scene, points, progress).tracks) > 60
+    assert len(sample_photos(tmp_path, scene, points, progress).tracks) > 60
 
 
 @pytest.mark.parametrize("background", [True, False], ids=["alpha is the background", "alpha cuts out"])
@@ -125,7 +125,7 @@ def test_masked_and_transparent_windows_are_left_out(
     tmp_path: Path, progress: SilentProgress, background: bool
 ) -> None:
     scene, points = photographed_points(tmp_path)
-    whole = look_at_photos(tmp_path, scene, points, progress).tracks
+    whole = sample_photos(tmp_path, scene, points, progress).tracks
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, 320:] = 0
     write_png(tmp_path / "masks/1.png.png", mask)
@@ -135,7 +135,7 @@ def test_masked_and_transparent_windows_are_left_out(
     masks = {"1.png": "masks/1.png.png"} | ({} if background else {"2.png": "masks/1.png.png"})
     views = [replace(view, mask=masks.get(view.name)) for view in scene.views]
     scene = replace(scene, views=tuple(views), has_alpha=background)
-    cut = look_at_photos(tmp_path, scene, points, progress).tracks
+    cut = sample_photos(tmp_path, scene, points, progress).tracks
     for number in range(6):
         of_view = points["view"] == 1 + number + (number > 2)
         reaching = np.count_nonzero(np.floor(points["xy"][of_view, 0]) + 2 >= 320)  # windows of five pixels
@@ -148,7 +148,7 @@ def test_clipped_windows_are_saturated(tmp_path: Path, progress: SilentProgress)
     gain = np.ones(VIEWS)
     gain[3] = 2.2
     scene, points = photographed_points(tmp_path, np.minimum(gain, 255 / 159))
-    tracks = look_at_photos(tmp_path, scene, points, progress).tracks
+    tracks = sample_photos(tmp_path, scene, points, progress).tracks
     bright = (tracks.view == 2) & (value(0)[tracks.point].max(axis=1) >= 157)
     assert np.array_equal(tracks.saturated, bright)
 
@@ -156,13 +156,13 @@ def test_clipped_windows_are_saturated(tmp_path: Path, progress: SilentProgress)
 def test_a_dark_channel_leaves_the_others_their_gains(tmp_path: Path, progress: SilentProgress) -> None:
     """Photos by lamplight: their blue is cut off nearly everywhere."""
     scene, points = photographed_points(tmp_path, np.linspace(0.8, 1.4, VIEWS))
-    by_day = fit_exposure(look_at_photos(tmp_path, scene, points, progress).tracks)
+    by_day = fit_exposure(sample_photos(tmp_path, scene, points, progress).tracks)
     for number, file in enumerate(sorted((tmp_path / "images").iterdir())):
         with Image.open(file) as image:
             pixels = np.asarray(image).copy()
         pixels[..., 2] = np.random.default_rng(number).integers(0, 3, pixels.shape[:2])
         write_png(file, pixels)
-    tracks = look_at_photos(tmp_path, scene, points, progress).tracks
+    tracks = sample_photos(tmp_path, scene, points, progress).tracks
     by_night = fit_exposure(tracks)
     assert not tracks.saturated.any() and by_night.known.all()
     np.testing.assert_allclose(by_night.log_gain[:, :2], by_day.log_gain[:, :2], atol=0.02)
@@ -217,7 +217,7 @@ def test_places_where_a_point_should_be_seen(tmp_path: Path, progress: SilentPro
     others = (points["point"] == point) & ~removed
     assert removed.sum() == 1 and others.sum() > 3
     fewer = {name: array[~removed] if name in ("view", "point", "xy") else array for name, array in points.items()}
-    expected = look_at_photos(tmp_path, scene, fewer, progress).expected
+    expected = sample_photos(tmp_path, scene, fewer, progress).expected
     found = (expected.view == 1) & (expected.point == point)
     assert found.sum() == 1
     np.testing.assert_allclose(expected.colour[found][0], value(0)[point] / 255, atol=1e-9)
@@ -256,14 +256,14 @@ def test_only_photos_nearby_are_asked_what_should_be_seen(monkeypatch: pytest.Mo
 
 def test_without_points_only_the_photos_are_looked_at(tmp_path: Path, progress: SilentProgress) -> None:
     scene, points = photographed_points(tmp_path)
-    looked = look_at_photos(tmp_path, scene, without_points(points), progress)
+    looked = sample_photos(tmp_path, scene, without_points(points), progress)
     assert len(looked.tracks) == len(looked.expected) == 0 and looked.tracks.views == 6
 
 
 def test_all_evidence_of_a_scene(tmp_path: Path, progress: SilentProgress) -> None:
     gain = np.where(np.arange(VIEWS) % 2, 1.0, 0.7)
     scene, points = photographed_points(tmp_path, gain)
-    found = scene_evidence(tmp_path, scene, points, {"images/1.png": None, "images/2.png": 0.1}, progress)
+    found = scene_statistics(tmp_path, scene, points, {"images/1.png": None, "images/2.png": 0.1}, progress)
     assert set(found.of) == {
         *("exposure", "tone", "view_dependence", "vignetting", "transients", "scale_variation", "participating_media"),
         *("background", "pose_refinement", "rolling_shutter"),
@@ -276,13 +276,13 @@ def test_all_evidence_of_a_scene(tmp_path: Path, progress: SilentProgress) -> No
     assert found.of["pose_refinement"].called_for is False
     assert found.of["rolling_shutter"].words == "no video, or one that hardly moves: nothing known"
     for name, evidence in found.of.items():
-        assert np.isfinite(evidence.statistic) and evidence.words, name
+        assert np.isfinite(evidence.value) and evidence.words, name
     assert set(found.seconds) == set(found.of) and min(found.seconds.values()) > 0
 
 
 def test_no_evidence_without_points(tmp_path: Path, progress: SilentProgress) -> None:
     scene, points = photographed_points(tmp_path)
-    found = scene_evidence(tmp_path, scene, without_points(points), {}, progress).of
+    found = scene_statistics(tmp_path, scene, without_points(points), {}, progress).of
     unsure = {name for name, evidence in found.items() if evidence.called_for is None}
     assert unsure == {"exposure", "view_dependence", "pose_refinement"}
     assert [name for name, evidence in found.items() if evidence.called_for] == ["background"]

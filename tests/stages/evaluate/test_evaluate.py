@@ -17,6 +17,7 @@ from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages import evaluate
+from stages.contract import run_stage
 from stages.evaluate import planning, seconds
 from stages.evaluate.image_metrics import ssim
 from stages.evaluate.summary import FIGURES
@@ -118,7 +119,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
 
 def _run(inputs: dict[str, Path], folder: Path, progress: Any, **settings: Any) -> tuple[dict[str, Any], str]:
     folder.mkdir()
-    result = evaluate.run(evaluate.Config(**settings), inputs, folder, progress)
+    result = run_stage(evaluate, evaluate.Config(**settings), inputs, folder, progress)
     return json.loads((folder / "metrics.json").read_text("utf-8")), result.line
 
 

@@ -12,6 +12,7 @@ from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
+from pipeline.engine.display import SilentDisplay
 from stages import evaluate
 from stages.effects.decisions import Decisions
 from stages.effects.image_effects import image_effects, learnt_effects, photo_effects
@@ -22,7 +23,6 @@ from stages.hardware.backend import chosen_backend, load_backend
 from stages.render.renderer import Renderer
 from stages.train.data import PhotoReader, training_dataset, view_rays
 from tests.stages.photo_scene import photographed
-from tests.synthetic_photos import Quiet
 
 METRICS: dict[str, Any] = {"psnr": 20.5, "psnr_interval": None, "ssim": 0.6, "psnr_nearest_view": 15.0} | {
     "psnr_mean_image": 12.0,
@@ -52,7 +52,7 @@ def test_fitted_poses_are_scored_at_the_photos_exposure(tmp_path: Path, monkeypa
     neutral = Renderer(AppearanceModel(field, (ExposureModel(torch.full((1, 3), 0.3)),)), torch.zeros(3))
     reader = PhotoReader(inputs["ingest"], scene, 1.0)
     scorer = scoring.Scorer(scene, inputs["ingest"], neutral, info, True, None, 1.0, reader, reader)
-    scored = scoring.score(scorer, tmp_path, Quiet()).images[0]
+    scored = scoring.score(scorer, tmp_path, SilentDisplay()).images[0]
     rays = view_rays(scene, view, 1.0)
     exposed = neutral.through(photo_effects(info, scene, view))
     assert given[0][0] is field and torch.equal(given[0][1], exposed.render(rays).colour)
@@ -67,7 +67,7 @@ def test_fitted_poses_are_scored_at_the_photos_exposure(tmp_path: Path, monkeypa
 def test_refined_poses_are_written_in_scene_units(tmp_path: Path) -> None:
     inputs, scene = photographed(tmp_path)
     views = scene.of_split("train")
-    dataset = training_dataset(inputs["ingest"], scene, "train", 1.0, Quiet())
+    dataset = training_dataset(inputs["ingest"], scene, "train", 1.0, SilentDisplay())
     near = dataset._replace(sparse_pixels=dataset.first_pixel[:-1] + 5, sparse_depths=torch.full((len(views),), 0.25))
     effects = image_effects(Decisions({"pose_refinement": {}}), views, near)
     effects.rays[0].parameters["offset"][1] = torch.tensor([1.0, 0.0, -2.0])

@@ -13,7 +13,7 @@ import nerf.kernels
 from nerf.kernels import torch as reference
 from nerf.kernels import warp
 from stages import evaluate, mesh, render, train
-from stages.contract import StageConfig, StageError
+from stages.contract import StageConfig, StageError, run_stage
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.io.field_files import load_field
 from stages.train import Config
@@ -134,7 +134,7 @@ def test_both_backends_train_the_same_field_from_photos(tmp_path: Path, progress
     for backend in backends:
         folder = tmp_path / backend
         folder.mkdir()
-        result = train.run(tiny(backend, steps=120), inputs, folder, progress)
+        result = run_stage(train, tiny(backend, steps=120), inputs, folder, progress)
         found[backend] = result.facts["probe_psnr"]
         assert load_field(folder)[1]["kind"] == "grid"
     flat = 11.0  # dB, of the best single colour
@@ -154,8 +154,8 @@ def test_what_torch_trained_stays_with_torch_in_every_stage(stage: ModuleType, t
     inputs, _ = photographed(tmp_path, channels=4)
     for name in ("train", "later"):
         (tmp_path / name).mkdir()
-    train.run(tiny("torch", steps=2), inputs, tmp_path / "train", progress)
+    run_stage(train, tiny("torch", steps=2), inputs, tmp_path / "train", progress)
     assert AS_TRAINED not in progress.notes
     with contextlib.suppress(StageError):  # two steps may leave no surface
-        stage.run(LATER[stage], inputs | {"train": tmp_path / "train"}, tmp_path / "later", progress)
+        run_stage(stage, LATER[stage], inputs | {"train": tmp_path / "train"}, tmp_path / "later", progress)
     assert progress.notes.count(AS_TRAINED) == 1

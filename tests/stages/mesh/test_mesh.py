@@ -14,7 +14,7 @@ import trimesh
 from nerf.geometry.camera_paths import look_at
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages import mesh
-from stages.contract import StageError
+from stages.contract import StageError, run_stage
 from stages.io.files import write_json, write_tensors
 from stages.mesh import extraction, preview, resolution, visibility
 from stages.mesh.extraction import vertex_colours
@@ -104,7 +104,7 @@ def run_mesh(tmp_path, progress, monkeypatch):
         write_json(inputs["train"] / "field.json", info)
         monkeypatch.setattr(extraction, "load_field", lambda *_: (model, info))
         config = mesh.Config.model_validate({"resolution": 48} | settings)
-        return mesh.run(config, inputs, tmp_path / folder, progress), tmp_path / folder
+        return run_stage(mesh, config, inputs, tmp_path / folder, progress), tmp_path / folder
 
     return run
 

@@ -16,7 +16,7 @@ from nerf.fields.interface import Rendering
 from nerf.geometry.region_of_interest import CaptureType
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages import render
-from stages.contract import StageError
+from stages.contract import StageError, run_stage
 from stages.io.files import read_json, write_json
 from stages.io.transforms_export import transforms
 from stages.render.path import CameraPath, make_path, median_camera, path_from_file, path_rays, resized
@@ -85,7 +85,7 @@ def given_path(content: dict[str, object], scene: Scene, folder: Path) -> Camera
 
 
 def run(inputs, progress, **config):
-    return render.run(render.Config(**config), inputs, inputs["render"], progress)
+    return run_stage(render, render.Config(**config), inputs, inputs["render"], progress)
 
 
 def test_video_and_depth_show_the_field_from_the_path(inputs, progress) -> None:

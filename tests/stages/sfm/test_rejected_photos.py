@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stages import sfm
-from stages.contract import StageError
+from stages.contract import StageError, run_stage
 from tests.blots import blots
 from tests.stages.sfm.sfm_inputs import SMALL, ingested
 
@@ -24,7 +24,7 @@ def turned(angle: float, panorama: np.ndarray, size: tuple[int, int] = (240, 180
 def refusal(images: dict[str, np.ndarray], folder: Path, progress) -> StageError:
     inputs = ingested(folder / "ingest", images)
     with pytest.raises(StageError) as error:
-        sfm.run(SMALL, inputs, folder / "sfm", progress)
+        run_stage(sfm, SMALL, inputs, folder / "sfm", progress)
     assert not (folder / "sfm" / "sparse").exists()
     assert not (folder / "sfm" / "registration.json").exists()
     return error.value
@@ -95,5 +95,7 @@ def test_intrinsics_that_cannot_be_those_of_the_photos_are_refused(
 ) -> None:
     images = {f"{i}.png": blots(i, *sizes[i % len(sizes)]) for i in range(3)}
     with pytest.raises(StageError) as caught:
-        sfm.run(SMALL.model_copy(update=given), ingested(tmp_path / "ingest", images), tmp_path / "sfm", progress)
+        run_stage(
+            sfm, SMALL.model_copy(update=given), ingested(tmp_path / "ingest", images), tmp_path / "sfm", progress
+        )
     assert (caught.value.what, caught.value.why) == ("cannot use --sfm.camera-params", why)

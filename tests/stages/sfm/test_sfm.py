@@ -15,8 +15,9 @@ import pytest
 from PIL import Image
 
 from nerf.geometry.alignment import align
+from pipeline.engine.display import SilentDisplay
 from stages import ingest, sfm
-from stages.contract import StageError
+from stages.contract import StageError, run_stage
 from stages.io.files import read_json, write_png
 from stages.io.photos import read_photos, write_photos
 from stages.sfm import worker_process
@@ -26,7 +27,7 @@ from stages.sfm.retry_strategies import STRATEGIES, Outcome, StrategyLog
 from tests.blots import blots
 from tests.small_scenes import write_blender_scene
 from tests.stages.sfm.sfm_inputs import SMALL, ingested
-from tests.synthetic_photos import Quiet, SyntheticPhotos
+from tests.synthetic_photos import SyntheticPhotos
 
 ROOT = Path(__file__).parents[3]
 
@@ -35,7 +36,7 @@ ROOT = Path(__file__).parents[3]
 def inputs(synthetic_photos: SyntheticPhotos, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The synthetic photos after ingest."""
     folder = tmp_path_factory.mktemp("ingest")
-    ingest.run(ingest.Config(photos=synthetic_photos.folder), {}, folder, Quiet())
+    ingest.run(ingest.Config(photos=synthetic_photos.folder), {}, folder, SilentDisplay())
     return {"ingest": folder}
 
 
@@ -43,7 +44,7 @@ def inputs(synthetic_photos: SyntheticPhotos, tmp_path_factory: pytest.TempPathF
 def reconstructed(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a finished run on the synthetic photos."""
     folder = tmp_path_factory.mktemp("sfm")
-    sfm.run(SMALL, inputs, folder, Quiet())
+    run_stage(sfm, SMALL, inputs, folder, SilentDisplay())
     return folder
 
 
@@ -85,8 +86,9 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from stages import sfm
-from tests.synthetic_photos import Quiet
-sfm.run(sfm.Config(max_features=1000), {"ingest": Path(sys.argv[1])}, Path(sys.argv[2]), Quiet())
+from stages.contract import run_stage
+from pipeline.engine.display import SilentDisplay
+run_stage(sfm, sfm.Config(max_features=1000), {"ingest": Path(sys.argv[1])}, Path(sys.argv[2]), SilentDisplay())
 """
 
 
@@ -113,7 +115,7 @@ def test_a_killed_run_ends_its_worker_and_resumes_identically(
     parent.kill()
     parent.wait()
     wait_for(lambda: is_gone(child))
-    sfm.run(SMALL, inputs, tmp_path, progress)
+    run_stage(sfm, SMALL, inputs, tmp_path, progress)
     assert progress.notes[0].startswith("resuming with the features of 12 photos and ")
     assert contents(tmp_path) == contents(reconstructed)
 
@@ -122,7 +124,7 @@ def test_a_damaged_database_is_made_anew(
     inputs: dict[str, Path], reconstructed: Path, tmp_path: Path, progress
 ) -> None:
     (tmp_path / f"matches-{version('pycolmap')}.db").write_bytes(b"SQLite format 3\0 and then nothing of use")
-    sfm.run(SMALL, inputs, tmp_path, progress)
+    run_stage(sfm, SMALL, inputs, tmp_path, progress)
     assert progress.notes[0] == "the matches of the interrupted run are damaged: starting over"
     assert contents(tmp_path) == contents(reconstructed)
 
@@ -141,7 +143,7 @@ def test_however_the_child_ends_it_is_an_error_with_words(
 ) -> None:
     monkeypatch.setattr(worker_process, "COMMAND", ["-c", child])
     with pytest.raises(StageError, match=message):
-        sfm.run(sfm.Config(max_seconds=0.5 if "sleep" in child else 60), inputs, tmp_path, progress)
+        run_stage(sfm, sfm.Config(max_seconds=0.5 if "sleep" in child else 60), inputs, tmp_path, progress)
     assert (tmp_path / "sfm.log").exists()
 
 
@@ -149,7 +151,7 @@ def test_strangers_are_named_alpha_and_mixed_sizes_work(inputs: dict[str, Path],
     images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:8]}
     alpha = {f"{n}.png": np.dstack([i, np.full(i.shape[:2], 255, np.uint8)]) for n, i in list(images.items())[:6]}
     plain = dict(list(images.items())[6:]) | {"stranger.png": blots(1, 300, 200)}
-    result = sfm.run(SMALL, ingested(tmp_path / "ingest", alpha | plain), tmp_path / "sfm", progress)
+    result = run_stage(sfm, SMALL, ingested(tmp_path / "ingest", alpha | plain), tmp_path / "sfm", progress)
     assert result.line.startswith("8/9 registered, ")
     notes = [re.sub(r"about .*", "…", note) for note in progress.notes if not note.startswith("camera model ")]
     assert notes == [
@@ -185,7 +187,7 @@ def test_near_duplicates_are_unmatched_and_masks_exclude_features(
     photos[5] = replace(photos[5], mask="masks/m.png")
     write_png(tmp_path / "ingest/masks/m.png", mask)
     write_photos(tmp_path / "ingest", photos, [], {})
-    result = sfm.run(SMALL, {"ingest": tmp_path / "ingest"}, tmp_path / "sfm", progress)
+    result = run_stage(sfm, SMALL, {"ingest": tmp_path / "ingest"}, tmp_path / "sfm", progress)
     account = read_json(tmp_path / "sfm/registration.json")
     model = read_model(tmp_path / "sfm/sparse")
     assert result.line.startswith("8/9 registered, ")
@@ -214,7 +216,7 @@ def test_a_known_camera_is_kept(
 ) -> None:
     lens = synthetic_photos.truth.camera
     config = SMALL.model_copy(update={"camera_model": lens.model, "camera_params": lens.params})
-    result = sfm.run(config, inputs, tmp_path, progress)
+    result = run_stage(sfm, config, inputs, tmp_path, progress)
     assert result.line.startswith("12/12 registered, ") and " · OPENCV · " in result.line
     assert read_model(tmp_path / "sparse").cameras == [lens]
     assert "the camera is kept as given" in progress.notes
@@ -234,7 +236,7 @@ def test_photos_with_gps_tell_metres_and_directions(
         for x, y, z in [centres[photo.name]]
     ]
     write_photos(ingest_folder, photos, [], {})
-    sfm.run(SMALL, {"ingest": ingest_folder}, tmp_path / "sfm", progress)
+    run_stage(sfm, SMALL, {"ingest": ingest_folder}, tmp_path / "sfm", progress)
     found = read_json(tmp_path / "sfm/registration.json")["georeference"]
     assert found["photos"] == 12 and 0 < found["error_m"] < 0.5
     images = read_model(tmp_path / "sfm/sparse").images
@@ -258,7 +260,7 @@ def test_one_degenerate_camera_does_not_end_the_run(
         "c.main()"
     )
     monkeypatch.setattr(worker_process, "COMMAND", ["-c", child])
-    sfm.run(SMALL, ingested(tmp_path / "ingest", images), tmp_path / "sfm", progress)
+    run_stage(sfm, SMALL, ingested(tmp_path / "ingest", images), tmp_path / "sfm", progress)
     assert "1 photo: the camera is degenerate (it is wrong): SIMPLE_PINHOLE instead" in progress.notes
     account, model = read_json(tmp_path / "sfm/registration.json"), read_model(tmp_path / "sfm/sparse")
     reasons = {image["file"]: image["reason"] for image in account["images"] if not image["registered"]}
@@ -307,9 +309,9 @@ def test_a_strategy_that_ended_the_worker_is_skipped(
     with monkeypatch.context() as patched:
         patched.setattr(worker_process, "COMMAND", ["-c", crash])
         with pytest.raises(StageError, match=message):
-            sfm.run(SMALL, folders, tmp_path / "sfm", progress)
+            run_stage(sfm, SMALL, folders, tmp_path / "sfm", progress)
     progress.notes.clear()
-    result = sfm.run(SMALL, folders, tmp_path / "sfm", progress)
+    result = run_stage(sfm, SMALL, folders, tmp_path / "sfm", progress)
     assert result.line.startswith("6/7 registered, ")
     assert progress.notes[0].startswith("resuming with the features of 7 photos and 21 matched pairs")
     assert f"skipped, because it {became} last time: matching them again with a relaxed ratio test" in progress.notes
@@ -332,7 +334,7 @@ def test_a_strategy_for_which_no_time_is_left_is_skipped(
     )
     monkeypatch.setattr(worker_process, "COMMAND", ["-c", slow])
     config = SMALL.model_copy(update={"max_seconds": 240.0})
-    result = sfm.run(config, with_a_stranger(inputs, tmp_path / "ingest"), tmp_path / "sfm", progress)
+    result = run_stage(sfm, config, with_a_stranger(inputs, tmp_path / "ingest"), tmp_path / "sfm", progress)
     assert result.line.startswith("6/7 registered, ")
     assert result.line.endswith(" · 1 retry strategy skipped for time: sfm --force")
     # All of the first time's 100 s of mapping, 1 - (6/7)² of those of matching; twice 100 s are for the adjustment.
@@ -350,12 +352,12 @@ def test_outcomes_whose_matches_are_gone_are_removed(
     inputs: dict[str, Path], reconstructed: Path, tmp_path: Path, progress
 ) -> None:
     StrategyLog(tmp_path / "strategies").add(Outcome("default", "matches-0.db", [["photo_000.jpg"] * 12], 500, 0.1))
-    sfm.run(SMALL, inputs, tmp_path, progress)
+    run_stage(sfm, SMALL, inputs, tmp_path, progress)
     assert contents(tmp_path) == contents(reconstructed)
 
 
 def test_the_screen_never_stands_still(inputs: dict[str, Path], tmp_path: Path, progress) -> None:
-    sfm.run(SMALL, inputs, tmp_path, progress)
+    run_stage(sfm, SMALL, inputs, tmp_path, progress)
     shares = [done for _, done in progress.updates if done is not None]
     assert shares == sorted(shares)
     assert 0 <= shares[0] < shares[-1] <= 1
@@ -366,8 +368,8 @@ def test_known_cameras_go_through_without_points(tmp_path: Path, progress) -> No
     write_blender_scene(tmp_path / "blender", train=4, test=1)
     config = ingest.Config(photos=tmp_path / "blender")
     ingest.run(config, {}, tmp_path / "ingest", progress)
-    result = sfm.run(
-        sfm.Config(cameras=tmp_path / "blender"), {"ingest": tmp_path / "ingest"}, tmp_path / "sfm", progress
+    result = run_stage(
+        sfm, sfm.Config(cameras=tmp_path / "blender"), {"ingest": tmp_path / "ingest"}, tmp_path / "sfm", progress
     )
     account = read_json(tmp_path / "sfm/registration.json")
     assert result.line == "5/5 poses imported · PINHOLE"
@@ -380,7 +382,7 @@ def test_known_cameras_go_through_without_points(tmp_path: Path, progress) -> No
 
 def test_photos_that_look_alike_are_enough(inputs: dict[str, Path], tmp_path: Path, progress) -> None:
     config = sfm.Config(max_features=1000, matcher="retrieval", neighbours=3)
-    result = sfm.run(config, inputs, tmp_path, progress)
+    result = run_stage(sfm, config, inputs, tmp_path, progress)
     assert result.line.startswith("12/12 registered")
     graph = read_json(tmp_path / "registration.json")["match_graph"]
     assert 12 * 3 / 2 <= graph["verified"] <= graph["tried"] < 12 * 11 / 2

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages import train
 from stages.contract import StageError
 from stages.io.files import read_json
 from stages.tradeoff.benchmark import (
@@ -30,7 +29,7 @@ def diverging(monkeypatch: pytest.MonkeyPatch) -> None:
     def diverges(*_: object) -> None:
         raise StageError(RUN_FAILURES[0], "training diverged", "it was told to", "Do not tell it to.")
 
-    monkeypatch.setattr(train, "run", diverges)
+    monkeypatch.setattr("stages.tradeoff.benchmark.run_stage", diverges)
 
 
 @pytest.mark.usefixtures("diverging")

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.cli.arguments import StageArguments, parse
+from pipeline.cli.arguments import StageArguments, parse, with_flags
 from pipeline.cli.options import with_effects
 from pipeline.engine.settings import Settings
 from stages.effects.decisions import Space
@@ -130,7 +130,8 @@ def test_the_command_of_a_setting_asks_for_what_it_was(variant: str, space: Spac
 @pytest.mark.parametrize("variant", ["grid", REDUCED, PUBLISHED])
 def test_the_command_is_taken_whatever_field_a_workspace_remembers(variant: str, remembered: dict[str, Any]) -> None:
     words = shlex.split(train_command(variant, 48.6, 2.0, "contracted", "fox.nerf"))[2:]
-    train = parse(StageArguments, "train", words, Settings(train=Config(**remembered))).settings.train
+    parsed = parse(StageArguments, "train", words).settings
+    train = with_flags(Settings(train=Config(**remembered)), parsed, "train", words).train
     assert (train.kind, train.steps, train.seconds) == (field_name(variant), None, 49)
     assert train.preset == VARIANTS[variant].options.get("preset", "standard")
 

@@ -3,7 +3,7 @@ import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import psutil
@@ -13,7 +13,7 @@ from PIL import Image
 
 from nerf.geometry.scene import Camera
 from stages import evaluate, tradeoff, train
-from stages.contract import StageError
+from stages.contract import StageError, run_stage
 from stages.effects.decisions import Decisions, write_decisions
 from stages.evaluate import tiles
 from stages.evaluate.tiles import MIN_TILES
@@ -216,7 +216,7 @@ def test_a_study_out_of_time_still_has_a_result(
 def test_the_workspaces_field_is_a_point_without_output(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
     own = tmp_path / "train" / "0123456789abcdef"
     own.mkdir(parents=True)
-    facts = train.run(train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, own, progress).facts
+    facts = run_stage(train, train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, own, progress).facts
     write_json(own / "manifest.json", {"facts": facts})
     with_own = studied(tmp_path / "own", photos | {"train": own}, progress)
     without = studied(tmp_path / "none", photos, progress)
@@ -237,7 +237,7 @@ def test_the_workspaces_slow_field_is_scored_on_some_pixels(
 ) -> None:
     own, kind = tmp_path / "train" / "0123456789abcdef", VanillaOptions(**TINY["vanilla"])
     own.mkdir(parents=True)
-    facts = train.run(train.Config(steps=70, downscale=1.0, vanilla=kind), photos, own, progress).facts
+    facts = run_stage(train, train.Config(steps=70, downscale=1.0, vanilla=kind), photos, own, progress).facts
     write_json(own / "manifest.json", {"facts": facts})
     crops = benchmark.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
     assert 0 < benchmark.rendering_seconds(own, crops) < 10
@@ -258,7 +258,7 @@ def test_the_workspaces_slow_field_is_scored_on_some_pixels(
 
 def test_a_slow_field_is_scored_on_the_same_crops(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
     scene = read_scene(photos["normalise"])
-    train.run(train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, tmp_path, progress)
+    run_stage(train, train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, tmp_path, progress)
     crops = benchmark.make_benchmark(photos["ingest"], scene, 1.0, 4, 1.0)
     whole, thinned = (benchmark.score(tmp_path, crops, progress, stride) for stride in (1, 4))
     assert whole["ssim"] is not None and thinned["ssim"] is None
@@ -268,7 +268,7 @@ def test_a_slow_field_is_scored_on_the_same_crops(tmp_path: Path, photos: dict[s
 def test_fields_are_scored_over_the_photos_background(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
     white, black = tmp_path / "white", tmp_path / "black"
     white.mkdir()
-    train.run(train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, white, progress)
+    run_stage(train, train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, white, progress)
     shutil.copytree(white, black)
     field = read_json(white / "field.json")
     write_json(black / "field.json", field | {"background": [0.0, 0.0, 0.0]})
@@ -281,14 +281,14 @@ def test_fields_are_scored_over_the_photos_background(tmp_path: Path, photos: di
 def test_a_run_that_does_not_learn_is_told(
     tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = train.run
+    whole = run_stage
 
-    def diverges(config: train.Config, *rest: Any) -> Any:
+    def diverges(stage: ModuleType, config: train.Config, *rest: Any) -> Any:
         if not config.vanilla.positional_encoding:
             raise StageError("train.diverged", "training diverged", "it was told to", "Do not tell it to.")
-        return whole(config, *rest)
+        return whole(stage, config, *rest)
 
-    monkeypatch.setattr(train, "run", diverges)
+    monkeypatch.setattr(benchmark, "run_stage", diverges)
     result = studied(tmp_path, photos, progress, seeds=1)
     content = read_json(tmp_path / "tradeoff.json")
     named = content["left_out"][-1]
@@ -303,9 +303,9 @@ def test_a_run_that_does_not_learn_is_told(
 def test_lack_of_memory_ends_and_resumes_the_study(
     tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole, asked = train.run, list[int]()
+    whole, asked = run_stage, list[int]()
 
-    def short_of_memory(config: train.Config, *rest: Any) -> Any:
+    def short_of_memory(stage: ModuleType, config: train.Config, *rest: Any) -> Any:
         asked.append(config.steps or 0)
         if len(asked) == 2:
             raise StageError(
@@ -314,9 +314,9 @@ def test_lack_of_memory_ends_and_resumes_the_study(
                 "5 grids take 1 TB and 8 GB are free",
                 "Smaller ones.",
             )
-        return whole(config, *rest)
+        return whole(stage, config, *rest)
 
-    monkeypatch.setattr(train, "run", short_of_memory)
+    monkeypatch.setattr(benchmark, "run_stage", short_of_memory)
     small = {"seconds": 8.0, "seeds": 1}
     with refused("tradeoff.stopped", "grid, full resolution", "seed 0", "not enough memory"):
         studied(tmp_path, photos, progress, **small)
@@ -365,8 +365,8 @@ def test_a_study_scores_as_evaluate_does(
     own, scored = tmp_path / "train", tmp_path / "evaluate"
     for folder in (own, scored):
         folder.mkdir()
-    train.run(train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, own, progress)
-    facts = evaluate.run(evaluate.Config(fraction=1), photos | {"train": own}, scored, progress).facts
+    run_stage(train, train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, own, progress)
+    facts = run_stage(evaluate, evaluate.Config(fraction=1), photos | {"train": own}, scored, progress).facts
     made = benchmark.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), None, 1000, 2.0)
     figures = benchmark.score(own, made, progress)
     assert figures["psnr"] == pytest.approx(facts["psnr"], abs=0.001)

@@ -9,6 +9,7 @@ import torch
 from nerf.runtime.matmul_precision import MediumPrecision
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from stages import train
+from stages.contract import run_stage
 from stages.effects.decisions import Decisions
 from stages.train import Config
 from stages.train.fields.vanilla_options import VanillaOptions
@@ -87,7 +88,7 @@ def test_it_is_set_while_training_alone_and_recorded(matmul, tmp_path: Path, her
     inputs, _ = photographed(tmp_path)
     here(FAST)
     (tmp_path / "train").mkdir()
-    result = train.run(Config(**TINY, steps=2, matmul=matmul), inputs, tmp_path / "train", progress)
+    result = run_stage(train, Config(**TINY, steps=2, matmul=matmul), inputs, tmp_path / "train", progress)
     assert trained_at == [matmul] * 2 and torch.get_float32_matmul_precision() == "highest"
     facts = {"matmul": matmul, "medium_matmul_speedup": 2.53, "medium_matmul_error": 1.2e-5}
     assert facts.items() <= result.facts.items()
@@ -106,6 +107,6 @@ def test_products_that_are_inexact_on_another_machine_are_said(tmp_path: Path, h
     here(INEXACT)
     for matmul in ("medium", "highest"):
         (tmp_path / matmul).mkdir()
-        train.run(Config(**TINY, steps=1, matmul=matmul), inputs, tmp_path / matmul, progress)
+        run_stage(train, Config(**TINY, steps=1, matmul=matmul), inputs, tmp_path / matmul, progress)
     said = [note for note in progress.notes if note.startswith("matrix products")]
     assert said == ["matrix products are off by 3e-04 here; --train.matmul highest computes exact ones"]

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.vanilla_trainer import VanillaTrainer
 from stages import train
-from stages.contract import Progress
+from stages.contract import Progress, run_stage
 from stages.hardware.device import cores
 from stages.io.field_files import load_field
 from stages.io.files import read_json
@@ -55,7 +55,7 @@ def tiny(field: FieldName = "vanilla", **settings: Any) -> Config:
 
 def trained(folder: Path, inputs: dict[str, Path], progress, field: FieldName = "vanilla", **settings):
     folder.mkdir(exist_ok=True)
-    return train.run(tiny(field, **settings), inputs, folder, progress)
+    return run_stage(train, tiny(field, **settings), inputs, folder, progress)
 
 
 def test_photos_become_a_field_that_beats_a_flat_colour(tmp_path: Path, progress) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerf.effects.statistics.additive_model import AdditiveModel, additive_model, inverted, solved
+from nerf.effects.statistics.additive_model import AdditiveModel, additive_model, conjugate_gradients, inverted
 
 
 def drawn(seed: int, views: int = 7, points: int = 40) -> tuple[AdditiveModel, np.ndarray]:
@@ -31,15 +31,15 @@ def test_parts_and_rest_are_those_of_least_squares() -> None:
     layout, weight = drawn(0)
     y = np.random.default_rng(1).normal(size=200)
     gain, rest = slow_fit(layout, y, weight)
-    np.testing.assert_allclose(layout.parts(y, weight), gain, atol=1e-9)
-    np.testing.assert_allclose(layout.rest(y, weight), rest, atol=1e-9)
+    np.testing.assert_allclose(layout.view_effects(y, weight), gain, atol=1e-9)
+    np.testing.assert_allclose(layout.residuals(y, weight), rest, atol=1e-9)
 
 
 def test_what_is_of_photos_and_points_alone_leaves_nothing() -> None:
     layout, weight = drawn(2)
     draw = np.random.default_rng(3)
     y = draw.normal(size=layout.views)[layout.view] + draw.normal(size=40)[layout.point]
-    np.testing.assert_allclose(layout.rest(y, weight), 0, atol=1e-9)
+    np.testing.assert_allclose(layout.residuals(y, weight), 0, atol=1e-9)
 
 
 def test_errors_are_those_of_repeated_draws() -> None:
@@ -48,8 +48,8 @@ def test_errors_are_those_of_repeated_draws() -> None:
     gains, errors = [], []
     for _ in range(300):
         y = draw.normal(size=200) / np.sqrt(weight)
-        gains.append(layout.parts(y, weight))
-        errors.append(layout.errors(layout.rest(y, weight), weight))
+        gains.append(layout.view_effects(y, weight))
+        errors.append(layout.standard_errors(layout.residuals(y, weight), weight))
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(errors), axis=0)), np.std(gains, axis=0), rtol=0.25)
 
 
@@ -86,9 +86,9 @@ def test_no_slope_over_what_belongs_to_photos() -> None:
 def test_the_largest_part_of_the_graph() -> None:
     view = np.array([0, 1, 1, 2, 4, 5, 3])
     point = np.array([0, 0, 1, 1, 2, 2, 3])
-    np.testing.assert_array_equal(additive_model(view, point, 6).main, [True, True, True, False, False, False])
-    assert not additive_model(np.zeros(0, int), np.zeros(0, int), 3).main.any()
-    assert not additive_model(np.array([0, 1]), np.array([0, 1]), 2).main.any()
+    np.testing.assert_array_equal(additive_model(view, point, 6).connected, [True, True, True, False, False, False])
+    assert not additive_model(np.zeros(0, int), np.zeros(0, int), 3).connected.any()
+    assert not additive_model(np.array([0, 1]), np.array([0, 1]), 2).connected.any()
 
 
 @pytest.mark.parametrize("length", [2, 3, 10])
@@ -112,9 +112,9 @@ def test_equations_are_solved_as_exactly_as_by_lapack(size: int, weakest: float)
     truth = np.random.default_rng(1).normal(size=size)
     right = matrix @ truth
     allowed = 1e-9 * max(1.0, np.linalg.cond(matrix) / 1e4)
-    np.testing.assert_allclose(solved(matrix, right), truth, atol=allowed)
+    np.testing.assert_allclose(conjugate_gradients(matrix, right), truth, atol=allowed)
     np.testing.assert_allclose(inverted(matrix) @ right, truth, atol=allowed)
-    assert np.array_equal(solved(matrix, np.zeros(size)), np.zeros(size))
+    assert np.array_equal(conjugate_gradients(matrix, np.zeros(size)), np.zeros(size))
 
 
 FIT = """

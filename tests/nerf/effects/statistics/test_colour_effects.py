@@ -7,7 +7,7 @@ import pytest
 
 from nerf.effects.statistics import outlier_images, view_dependence, vignetting, warnings
 from nerf.effects.statistics.exposure import EV, fit_exposure
-from nerf.effects.statistics.statistic import Evidence
+from nerf.effects.statistics.statistic import Statistic
 from nerf.effects.statistics.tracks import TrackColours
 from nerf.rendering.srgb import linear_light
 from tests.nerf.effects.statistics.photographed_points import encoded, photographed_points
@@ -33,8 +33,8 @@ def shining(seed: int, strength: float, **settings: object) -> TrackColours:
 def test_vignetting_is_found_under_exposures(gain: float) -> None:
     for seed in SEEDS:
         tracks = photographed_points(seed, log_gain=exposed(seed), vignetting=gain)
-        found = vignetting.vignetting_evidence(tracks, fit_exposure(tracks))
-        assert abs(found.statistic - abs(gain) / EV) < 5 * found.noise
+        found = vignetting.vignetting_statistic(tracks, fit_exposure(tracks))
+        assert abs(found.value - abs(gain) / EV) < 5 * found.noise
         assert found.called_for is (True if gain == -0.33 else found.called_for)
         assert (" darker than " in found.words) == (gain < 0)
 
@@ -44,28 +44,28 @@ def test_exposure_is_not_mistaken_for_vignetting() -> None:
         tracks = photographed_points(seed, log_gain=exposed(seed), outliers=0.02)
         # photos of which some show points in their middle only
         tracks = replace(tracks, radius=np.where(tracks.view % 2, 0.3 * tracks.radius, tracks.radius))
-        assert vignetting.vignetting_evidence(tracks, fit_exposure(tracks)).called_for is False
+        assert vignetting.vignetting_statistic(tracks, fit_exposure(tracks)).called_for is False
 
 
 def test_points_at_one_radius_say_nothing_of_vignetting() -> None:
     tracks = photographed_points(0)
     tracks = replace(tracks, radius=np.full(len(tracks), 0.5))
-    found = vignetting.vignetting_evidence(tracks, fit_exposure(tracks))
+    found = vignetting.vignetting_statistic(tracks, fit_exposure(tracks))
     assert found.called_for is False and found.words == "every point lies at one radius in all photos: nothing known"
 
 
 def test_diffuse_points_do_not_call_for_view_dependence() -> None:
     for seed in SEEDS:
         tracks = photographed_points(seed, log_gain=exposed(seed), points=600, outliers=0.01)
-        assert view_dependence.view_dependence_evidence(tracks, fit_exposure(tracks)).called_for is False
+        assert view_dependence.view_dependence_statistic(tracks, fit_exposure(tracks)).called_for is False
 
 
 def test_shining_points_call_for_view_dependence() -> None:
     for seed in SEEDS:
         tracks = shining(seed, 0.035, points=600, log_gain=exposed(seed))
-        found = view_dependence.view_dependence_evidence(tracks, fit_exposure(tracks))
+        found = view_dependence.view_dependence_statistic(tracks, fit_exposure(tracks))
         assert found.called_for is True, found
-        assert 0.018 < found.statistic < 0.04
+        assert 0.018 < found.value < 0.04
 
 
 def test_rough_windows_seen_from_aside_are_not_view_dependence() -> None:
@@ -79,17 +79,17 @@ def test_rough_windows_seen_from_aside_are_not_view_dependence() -> None:
         phase = draw.uniform(0, 2 * np.pi, (tracks.point.max() + 1, 3))[tracks.point]
         colour = np.clip(tracks.colour + 0.3 * texture[:, None] * np.sin(azimuth[:, None] + phase), 0, 1)
         rough = replace(tracks, colour=colour, texture=texture)
-        told = view_dependence.view_dependence_evidence(rough, fit_exposure(rough))
+        told = view_dependence.view_dependence_statistic(rough, fit_exposure(rough))
         untold = replace(rough, texture=None)
-        taken = view_dependence.view_dependence_evidence(untold, fit_exposure(untold))
-        assert told.statistic < 0.7 * taken.statistic
+        taken = view_dependence.view_dependence_statistic(untold, fit_exposure(untold))
+        assert told.value < 0.7 * taken.value
         assert told.called_for is not True
 
 
 def test_one_direction_says_nothing_of_view_dependence() -> None:
     tracks = photographed_points(0)
     tracks = replace(tracks, towards=np.tile([0.0, 0.0, 1.0], (len(tracks), 1)))
-    found = view_dependence.view_dependence_evidence(tracks, fit_exposure(tracks))
+    found = view_dependence.view_dependence_statistic(tracks, fit_exposure(tracks))
     assert found.called_for is None and found.words == (
         "points are seen from directions 0.0° to 0.0° apart, too alike to compare: nothing known"
     )
@@ -111,9 +111,9 @@ def passed_by(seed: int, share: float, photos: int = 2) -> tuple[TrackColours, T
     return seen.only(~expected), seen.only(expected)
 
 
-def passers_by(tracks: TrackColours, expected: TrackColours | None) -> Evidence:
+def passers_by(tracks: TrackColours, expected: TrackColours | None) -> Statistic:
     fit = fit_exposure(tracks)
-    return warnings.transients_evidence(outlier_images.outlier_images(tracks, fit, expected), fit)
+    return warnings.transients_statistic(outlier_images.outlier_images(tracks, fit, expected), fit)
 
 
 def test_a_passer_by_in_few_photos_is_seen() -> None:
@@ -174,19 +174,19 @@ def hazy(seed: int, per_unit: float) -> TrackColours:
 def test_fog_is_seen_and_clear_air_is_not() -> None:
     for seed in SEEDS:
         fog, clear = hazy(seed, 0.5), hazy(seed, 0.0)
-        assert warnings.participating_media_evidence(fog, fit_exposure(fog)).called_for is True
-        assert warnings.participating_media_evidence(clear, fit_exposure(clear)).called_for is False
+        assert warnings.participating_media_statistic(fog, fit_exposure(fog)).called_for is True
+        assert warnings.participating_media_statistic(clear, fit_exposure(clear)).called_for is False
 
 
 def test_without_tracks_nothing_is_known() -> None:
     none = TrackColours.empty(3)
     fit = fit_exposure(none)
     for found, decided in (
-        (vignetting.vignetting_evidence(none, fit), False),
-        (view_dependence.view_dependence_evidence(none, fit), None),
+        (vignetting.vignetting_statistic(none, fit), False),
+        (view_dependence.view_dependence_statistic(none, fit), None),
         (passers_by(none, none), False),
         (passers_by(none, None), False),
-        (warnings.participating_media_evidence(none, fit), False),
+        (warnings.participating_media_statistic(none, fit), False),
     ):
         assert found.called_for is decided and found.words.endswith(": nothing known")
-        assert found.statistic == 0 and np.isinf(found.noise)
+        assert found.value == 0 and np.isinf(found.noise)

@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerf.effects.statistics.exposure import EV, THRESHOLD_EV, exposure_evidence, fit_exposure
+from nerf.effects.statistics.exposure import EV, THRESHOLD_EV, exposure_statistic, fit_exposure
 from nerf.effects.statistics.tracks import TrackColours
-from nerf.effects.statistics.warnings import tone_evidence
+from nerf.effects.statistics.warnings import tone_statistic
 from tests.nerf.effects.statistics.photographed_points import photographed_points
 
 SEEDS = range(20)
@@ -61,68 +61,68 @@ def test_occluded_photos_do_not_count() -> None:
     gain = np.zeros((12, 3))
     gain[:3] = 0.5 * EV
     fit, odd = fit_exposure(photographed_points(5, log_gain=gain)), np.arange(12) < 3
-    assert exposure_evidence(fit).called_for is True
-    found = exposure_evidence(fit, None, odd)
+    assert exposure_statistic(fit).called_for is True
+    found = exposure_statistic(fit, None, odd)
     assert found.called_for is False and "; without 3 photos with something in the way" in found.words
-    assert exposure_evidence(fit, None, np.ones(12, bool)).statistic == exposure_evidence(fit).statistic
+    assert exposure_statistic(fit, None, np.ones(12, bool)).value == exposure_statistic(fit).value
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.05])
 @pytest.mark.parametrize("noise", [0.003, 0.03])
 def test_equal_exposures_are_not_called_for(noise: float, outliers: float) -> None:
     for seed in SEEDS:
-        found = exposure_evidence(fit_exposure(photographed_points(seed, noise=noise, outliers=outliers)))
+        found = exposure_statistic(fit_exposure(photographed_points(seed, noise=noise, outliers=outliers)))
         assert found.called_for is False, found
 
 
 def test_the_least_difference_is_called_for() -> None:
     for seed in SEEDS:
         gain = drawn_gains(seed, 12, 1.15 * THRESHOLD_EV)
-        found = exposure_evidence(fit_exposure(photographed_points(seed, log_gain=gain)))
+        found = exposure_statistic(fit_exposure(photographed_points(seed, log_gain=gain)))
         assert found.called_for is True, found
-        assert 0.9 < found.statistic / (1.15 * THRESHOLD_EV) < 1.1
+        assert 0.9 < found.value / (1.15 * THRESHOLD_EV) < 1.1
 
 
 @pytest.mark.parametrize(("deviation_ev", "called_for"), [(0.0, False), (0.2, True)])
 def test_a_photo_that_is_badly_measured_decides_nothing(deviation_ev: float, called_for: bool) -> None:
     for seed in SEEDS:
         fit = fit_exposure(photographed_points(seed, log_gain=drawn_gains(seed, 12, 1.0) * deviation_ev))
-        assert exposure_evidence(fit).called_for is called_for
+        assert exposure_statistic(fit).called_for is called_for
         gain, error = fit.log_gain.copy(), fit.error.copy()
         gain[4, 0], error[4, 0] = gain[4, 0] + 1.2 * EV, EV
-        found = exposure_evidence(fit._replace(log_gain=gain, error=error), np.zeros(12))
+        found = exposure_statistic(fit._replace(log_gain=gain, error=error), np.zeros(12))
         assert found.called_for is called_for, found
         assert "; 1 photos do not count, their gains are not known to 0.1 EV; EXIF tells of 0 EV" in found.words
-        bent = tone_evidence(fit._replace(contrast=np.eye(12)[4], contrast_error=fit.contrast_error + np.eye(12)[4]))
+        bent = tone_statistic(fit._replace(contrast=np.eye(12)[4], contrast_error=fit.contrast_error + np.eye(12)[4]))
         assert bent.called_for is False
-        unsure = exposure_evidence(fit._replace(error=fit.error + EV))
+        unsure = exposure_statistic(fit._replace(error=fit.error + EV))
         assert unsure.called_for is None and "do not count" not in unsure.words, "better than nothing"
 
 
 def test_exif_exposures_decide_nothing() -> None:
     gain = np.linspace(-0.5, 0.5, 12) * EV
     fit = fit_exposure(photographed_points(3, log_gain=gain))
-    alone = exposure_evidence(fit)
+    alone = exposure_statistic(fit)
     told = gain / EV + 7.0  # the constant is unknown
-    agreeing, deviating = exposure_evidence(fit, told), exposure_evidence(fit, -told)
+    agreeing, deviating = exposure_statistic(fit, told), exposure_statistic(fit, -told)
     assert agreeing.words.startswith(f"{alone.words}; EXIF tells of 1 EV, the gains deviate from it by 0.0")
     assert "deviate from it by 0.6" in deviating.words  # twice the gains' own deviation, 0.314
     assert agreeing[:5] == deviating[:5] == alone[:5]
     sparse = np.where(np.arange(12) < 1, told, np.nan)
-    assert exposure_evidence(fit, sparse) == exposure_evidence(fit, np.full(12, np.nan)) == alone
+    assert exposure_statistic(fit, sparse) == exposure_statistic(fit, np.full(12, np.nan)) == alone
 
 
 def test_between_the_thresholds_a_pilot_decides() -> None:
     for seed in SEEDS:
         gain = drawn_gains(seed, 12, 0.75 * THRESHOLD_EV)
-        assert exposure_evidence(fit_exposure(photographed_points(seed, log_gain=gain))).called_for is None
+        assert exposure_statistic(fit_exposure(photographed_points(seed, log_gain=gain))).called_for is None
 
 
 def test_vignetting_is_not_mistaken_for_exposure() -> None:
     for seed in SEEDS:
         fit = fit_exposure(photographed_points(seed, vignetting=-0.7))
         np.testing.assert_allclose(fit.vignetting, -0.7, atol=0.05)
-        assert exposure_evidence(fit).called_for is False
+        assert exposure_statistic(fit).called_for is False
 
 
 def test_highlights_in_one_photo_hardly_move_its_gain() -> None:
@@ -149,27 +149,27 @@ def test_photos_without_common_points_have_infinite_error() -> None:
     np.testing.assert_array_equal(fit.known, [True] * 6 + [False] * 3)
     assert np.isinf(fit.error[6:]).all() and np.isfinite(fit.error[:6]).all()
     np.testing.assert_array_equal(fit.log_gain[6:], 0)
-    assert exposure_evidence(fit).words.endswith("; 3 photos share hardly any points with the others")
+    assert exposure_statistic(fit).words.endswith("; 3 photos share hardly any points with the others")
 
 
 def test_without_tracks_nothing_is_known() -> None:
     fit = fit_exposure(TrackColours.empty(5))
     assert fit.log_gain.shape == (5, 3) and np.isinf(fit.error).all()
-    assert exposure_evidence(fit).called_for is None and tone_evidence(fit).called_for is False
-    assert exposure_evidence(fit).words == tone_evidence(fit).words == "no tracks: nothing known"
+    assert exposure_statistic(fit).called_for is None and tone_statistic(fit).called_for is False
+    assert exposure_statistic(fit).words == tone_statistic(fit).words == "no tracks: nothing known"
 
 
 @pytest.mark.parametrize("points", [1, 3])
 def test_so_few_common_points_are_no_evidence(points: int) -> None:
     fit = fit_exposure(photographed_points(8, views=3, points=points, per_point=3, log_gain=np.array([0.0, 0.5, 1.0])))
     assert np.isfinite(fit.log_gain).all()
-    assert exposure_evidence(fit).called_for is not True
+    assert exposure_statistic(fit).called_for is not True
 
 
 def test_the_words() -> None:
     gain = np.zeros(12)
     gain[3] = 0.8 * EV
-    words = exposure_evidence(fit_exposure(photographed_points(9, points=4000, log_gain=gain, noise=0.002))).words
+    words = exposure_statistic(fit_exposure(photographed_points(9, points=4000, log_gain=gain, noise=0.002))).words
     assert words.startswith("gains span 0.8 EV, ") and words.endswith(" × their noise")
 
 
@@ -177,6 +177,6 @@ def test_powers_are_seen_as_tone_and_gains_are_not() -> None:
     for seed in SEEDS:
         power = np.ones(12)
         power[::2] = 1.5
-        bent = tone_evidence(fit_exposure(photographed_points(seed, gamma=power)))
-        straight = tone_evidence(fit_exposure(photographed_points(seed, log_gain=drawn_gains(seed, 12, 0.4))))
+        bent = tone_statistic(fit_exposure(photographed_points(seed, gamma=power)))
+        straight = tone_statistic(fit_exposure(photographed_points(seed, log_gain=drawn_gains(seed, 12, 0.4))))
         assert bent.called_for is True and straight.called_for is False, (bent, straight)

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerf.effects.statistics.background import background_evidence, untracked_share
-from nerf.effects.statistics.poses import common_residuals, pose_evidence
+from nerf.effects.statistics.background import background_statistic, untracked_share
+from nerf.effects.statistics.poses import common_residuals, pose_statistic
 from nerf.effects.statistics.tracks import TrackColours
 from nerf.effects.statistics.warnings import (
     across_rows,
     motion_to_next,
-    rolling_shutter_evidence,
-    scale_variation_evidence,
+    rolling_shutter_statistic,
+    scale_variation_statistic,
 )
 from tests.nerf.effects.statistics.photographed_points import photographed_points
 
@@ -25,8 +25,8 @@ def test_the_ratio_of_footprints(ratio: float, called_for: bool | None) -> None:
         tracks = photographed_points(seed)
         near = tracks.view < 6  # every point is seen by five photos in a row: some by both kinds, some by one
         tracks = replace(tracks, footprint=np.where(near, 1.0, ratio))
-        found = scale_variation_evidence(tracks)
-        assert found.statistic == pytest.approx(ratio) and found.called_for is called_for
+        found = scale_variation_statistic(tracks)
+        assert found.value == pytest.approx(ratio) and found.called_for is called_for
 
 
 def test_far_and_near_photos_are_compared_through_others() -> None:
@@ -37,8 +37,8 @@ def test_far_and_near_photos_are_compared_through_others() -> None:
             tracks.view + 4 > tracks.point * 0 + np.repeat(tracks.view[::4], 4)
         )  # none from last to first
         point_size = np.random.default_rng(seed).uniform(0.5, 2, walk.point.max() + 1)[walk.point]
-        found = scale_variation_evidence(replace(walk, footprint=point_size * 6.0 ** (walk.view / 29)))
-        assert found.called_for is True and 4.5 < found.statistic < 6
+        found = scale_variation_statistic(replace(walk, footprint=point_size * 6.0 ** (walk.view / 29)))
+        assert found.called_for is True and 4.5 < found.value < 6
         assert found.words.startswith("pixels at the same points differ 1.2-fold in size, by way of other photos ")
 
 
@@ -46,16 +46,16 @@ def test_a_few_false_points_are_no_scale() -> None:
     tracks = photographed_points(0)
     footprint = np.ones(len(tracks))
     footprint[:30:5] = 50
-    assert 1 <= scale_variation_evidence(replace(tracks, footprint=footprint)).statistic < 1.2
-    assert scale_variation_evidence(TrackColours.empty(2)).words == "no tracks: nothing known"
+    assert 1 <= scale_variation_statistic(replace(tracks, footprint=footprint)).value < 1.2
+    assert scale_variation_statistic(TrackColours.empty(2)).words == "no tracks: nothing known"
 
 
 @pytest.mark.parametrize("share", [0.0, 0.008, 0.05])
 def test_background_is_modelled_unless_alpha_rules_it_out(share: float) -> None:
     position = np.zeros((4000, 3))
     position[: int(share * 4000), 2] = -5
-    found = background_evidence(position, np.repeat(np.arange(4000), 3), False, 0.1)
-    assert found.called_for is True and abs(found.statistic - share) < 1e-9
+    found = background_statistic(position, np.repeat(np.arange(4000), 3), False, 0.1)
+    assert found.called_for is True and abs(found.value - share) < 1e-9
     assert np.isinf([found.threshold, found.noise]).all()  # neither decides anything
     assert found.words == (
         f"only alpha could tell that nothing lies beyond the region: {share:.1%} of what is tracked does, "
@@ -64,9 +64,9 @@ def test_background_is_modelled_unless_alpha_rules_it_out(share: float) -> None:
 
 
 def test_alpha_says_what_is_background() -> None:
-    assert background_evidence(np.full((9, 3), 5.0), np.arange(9), True, 0.5).called_for is False
-    assert background_evidence(np.zeros((0, 3)), np.zeros(0, int), True, 1.0).called_for is False
-    assert background_evidence(np.zeros((0, 3)), np.zeros(0, int), False, 1.0).words == "no tracks: nothing known"
+    assert background_statistic(np.full((9, 3), 5.0), np.arange(9), True, 0.5).called_for is False
+    assert background_statistic(np.zeros((0, 3)), np.zeros(0, int), True, 1.0).called_for is False
+    assert background_statistic(np.zeros((0, 3)), np.zeros(0, int), False, 1.0).words == "no tracks: nothing known"
 
 
 def test_untracked_parts_of_photos() -> None:
@@ -96,23 +96,23 @@ def test_right_poses_are_left_alone() -> None:
     for seed in SEEDS:
         power, expected = common_residuals(*residuals(seed, 0, 0), views=10)
         assert 0.5 < power.mean() / expected.mean() < 2
-        assert pose_evidence(power, expected, np.full(10, np.nan)).called_for is False
+        assert pose_statistic(power, expected, np.full(10, np.nan)).called_for is False
 
 
 @pytest.mark.parametrize(("shift_px", "turn", "size_px"), [(1.0, 0.0, 1.0), (0.0, 0.003, 1.06), (5.0, 0.0, 5.0)])
 def test_wrong_poses_are_seen(shift_px: float, turn: float, size_px: float) -> None:
     for seed in SEEDS:
-        found = pose_evidence(*common_residuals(*residuals(seed, shift_px, turn), views=10), np.full(10, 0.02))
+        found = pose_statistic(*common_residuals(*residuals(seed, shift_px, turn), views=10), np.full(10, 0.02))
         assert found.called_for is True
-        assert abs(found.statistic / size_px - 1) < 0.15
+        assert abs(found.value / size_px - 1) < 0.15
 
 
 def test_uncertain_poses_leave_refinement_open() -> None:
     power, expected = common_residuals(*residuals(0, 0, 0), views=10)
     none = np.full(10, np.nan)
     for stated, called_for in ((1.5, None), (0.4, None), (0.2, False)):
-        assert pose_evidence(power, expected, np.full(10, stated)).called_for is called_for
-        assert pose_evidence(none, none, np.full(10, stated)).called_for is called_for
+        assert pose_statistic(power, expected, np.full(10, stated)).called_for is called_for
+        assert pose_statistic(none, none, np.full(10, stated)).called_for is called_for
 
 
 @pytest.mark.parametrize(("bad", "called_for"), [(1, False), (10, False), (30, True)])
@@ -122,15 +122,15 @@ def test_a_few_photos_do_not_call_for_refining_all(bad: int, called_for: bool) -
     power = expected * draw.chisquare(4, 100) / 4
     stated = np.full(100, 0.03)
     stated[:bad] = 7.0
-    assert pose_evidence(power, expected, stated).called_for is (None if called_for else False)
+    assert pose_statistic(power, expected, stated).called_for is (None if called_for else False)
     power[:bad] += 7.0**2
-    assert pose_evidence(power, expected, np.full(100, 0.03)).called_for is called_for
+    assert pose_statistic(power, expected, np.full(100, 0.03)).called_for is called_for
 
 
 def test_photos_with_too_few_points_are_left_out() -> None:
     power, expected = common_residuals(np.ones((5, 2)), np.ones((5, 2)), np.zeros(5, int), 2)
     assert np.isnan(power).all() and np.isnan(expected).all()
-    assert pose_evidence(power, expected, np.full(2, np.nan)).called_for is None
+    assert pose_statistic(power, expected, np.full(2, np.nan)).called_for is None
     assert len(common_residuals(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, int), 0)[0]) == 0
 
 
@@ -144,9 +144,9 @@ def test_rows_taken_one_after_another(readout: float, called_for: bool) -> None:
         residual = (
             residual + np.where(view == 9, 0, readout * (row - 0.5))[:, None] * np.where(view == 9, 0, motion[view].T).T
         )
-        found = rolling_shutter_evidence(residual, row, motion, view)
+        found = rolling_shutter_statistic(residual, row, motion, view)
         assert found.called_for is called_for, found
-        still = rolling_shutter_evidence(residual, row, np.full((10, 2), np.nan), view)
+        still = rolling_shutter_statistic(residual, row, np.full((10, 2), np.nan), view)
         assert still.called_for is False and np.isinf(still.noise)
 
 

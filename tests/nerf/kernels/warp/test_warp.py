@@ -297,7 +297,7 @@ def test_no_rays_and_no_samples_are_fine_even_at_first(device: str, rays: int) -
     on_a_new_thread(everything)
 
 
-KERNEL: Any = occupancy._raise
+KERNEL: Any = occupancy._scatter_max
 GOOD = torch.zeros(8, 3)
 
 
@@ -314,16 +314,16 @@ GOOD = torch.zeros(8, 3)
 def test_what_a_kernel_cannot_read_is_refused_by_name(points: Tensor, message: str) -> None:
     """A recorded launch looks as closely as the one that is recorded."""
     arguments = torch.zeros(64), points, torch.zeros(8)
-    with pytest.raises(TypeError, match=f"_raise: {message}"):
+    with pytest.raises(TypeError, match=f"_scatter_max: {message}"):
         on_a_new_thread(lambda: launch(KERNEL, 8, 4, *arguments))
     launch(KERNEL, 8, 4, arguments[0], GOOD, arguments[2])
-    with pytest.raises(TypeError, match=f"_raise: {message}"):
+    with pytest.raises(TypeError, match=f"_scatter_max: {message}"):
         launch(KERNEL, 8, 4, *arguments)
 
 
 def test_tensors_in_two_memories_are_refused() -> None:
     """A tensor of no memory stands for one of another GPU: whether it is on a GPU at all tells neither."""
-    with pytest.raises(TypeError, match=r"_raise: points must be .* on cpu; it is .*, contiguous, on meta"):
+    with pytest.raises(TypeError, match=r"_scatter_max: points must be .* on cpu; it is .*, contiguous, on meta"):
         launch(KERNEL, 8, 4, torch.zeros(64), GOOD.to("meta"), torch.zeros(8))
 
 
@@ -333,13 +333,15 @@ def test_tensors_on_a_gpu_and_elsewhere_are_refused(other: str) -> None:
     skip_without("cuda")
     if other == "cuda:1" and torch.cuda.device_count() < 2:
         pytest.skip("no second GPU")
-    with pytest.raises(TypeError, match=f"_raise: points must be .* on cuda:0; it is .*, contiguous, on {other}"):
+    with pytest.raises(TypeError, match=f"_scatter_max: points must be .* on cuda:0; it is .*, contiguous, on {other}"):
         launch(KERNEL, 8, 4, torch.zeros(64, device="cuda:0"), GOOD.to(other), torch.zeros(8, device="cuda:0"))
 
 
 def test_numbers_and_tensors_are_not_confused() -> None:
     thickness, values = torch.zeros(64), torch.zeros(8)
-    with pytest.raises(TypeError, match=r"_raise: cells must be a number; it is \(8,\) torch.float32"):
+    with pytest.raises(TypeError, match=r"_scatter_max: cells must be a number; it is \(8,\) torch.float32"):
         on_a_new_thread(lambda: launch(KERNEL, 8, values, thickness, GOOD, values))
-    with pytest.raises(TypeError, match=r"_raise: values must be contiguous .* in entries of 1 on cpu; it is 2.0"):
+    with pytest.raises(
+        TypeError, match=r"_scatter_max: values must be contiguous .* in entries of 1 on cpu; it is 2.0"
+    ):
         on_a_new_thread(lambda: launch(KERNEL, 8, 4, thickness, GOOD, 2.0))

@@ -21,9 +21,9 @@ def run(kernel: Any, count: int, *arguments: Any) -> None:
 
 def test_encoding() -> None:
     points, table = uniform("cpu", 1, 99, 3), normal("cpu", 2, LAYOUT.rows, 4)
-    lanes, levels = torch.empty(99, LAYOUT.width), encoding._levels(LAYOUT, points.device)
-    run(encoding._encode_lanes, 3 * 99, levels, 3, table, points, lanes)
-    torch.testing.assert_close(lanes, warp.encode(LAYOUT, table, points))
+    found, levels = torch.empty(99, LAYOUT.width), encoding._levels(LAYOUT, points.device)
+    run(encoding._encode_gpu, 3 * 99, levels, 3, table, points, found)
+    torch.testing.assert_close(found, warp.encode(LAYOUT, table, points))
 
 
 def test_gradients_of_the_table() -> None:
@@ -31,7 +31,7 @@ def test_gradients_of_the_table() -> None:
     wanted, found = torch.zeros(LAYOUT.rows, 4), torch.zeros(LAYOUT.rows, 4)
     warp.encode_backward_table(LAYOUT, range(1, 3), points, grad, wanted)
     levels = encoding._levels(LAYOUT, points.device)
-    run(encoding._encode_backward_table_lanes, 2 * 99, levels, 3, 1, 99, points, grad, found)
+    run(encoding._encode_backward_table_gpu, 2 * 99, levels, 3, 1, 99, points, grad, found)
     torch.testing.assert_close(found, wanted)
     assert wanted.any() and not wanted[: LAYOUT.level_offsets[1]].any()
 
@@ -40,15 +40,15 @@ def test_hidden_layer() -> None:
     samples, of_ray = packed("cpu", COUNTS), normal("cpu", 3, len(COUNTS), 64)
     hidden, grad = normal("cpu", 4, len(samples.t), 64), normal("cpu", 5, len(samples.t), 64)
     hidden[5, 7] = torch.nan
-    by_lanes, its_grad = hidden.clone(), grad.clone()
+    by_gpu_kernel, its_grad = hidden.clone(), grad.clone()
     warp.add_ray_relu(samples, hidden, of_ray)
-    run(hidden_layer._add_ray_relu_lanes, 16 * len(hidden), samples.ray, of_ray, by_lanes)
-    torch.testing.assert_close(by_lanes, hidden, rtol=0, atol=0, equal_nan=True)
+    run(hidden_layer._add_ray_relu_gpu, 16 * len(hidden), samples.ray, of_ray, by_gpu_kernel)
+    torch.testing.assert_close(by_gpu_kernel, hidden, rtol=0, atol=0, equal_nan=True)
     hidden[5, 7] = 1.0
     wanted, found = warp.add_ray_relu_backward(samples, hidden, grad), torch.empty(len(COUNTS), 64)
-    run(hidden_layer._add_ray_relu_backward_lanes, 16 * len(found), samples.starts, hidden, its_grad, found)
+    run(hidden_layer._add_ray_relu_backward_gpu, 16 * len(found), samples.starts, hidden, its_grad, found)
     torch.testing.assert_close((found, its_grad), (wanted, grad))
-    run(hidden_layer._relu_backward_lanes, 16 * len(hidden), hidden, (again := normal("cpu", 5, len(hidden), 64)))
+    run(hidden_layer._relu_backward_gpu, 16 * len(hidden), hidden, (again := normal("cpu", 5, len(hidden), 64)))
     torch.testing.assert_close(again, grad)
 
 

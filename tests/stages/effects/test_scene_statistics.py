@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nerf.effects.statistics.statistic import Evidence
+from nerf.effects.statistics.statistic import Statistic
 from nerf.geometry.scene import Camera, Scene, Similarity, View
-from stages.effects.evidence import (
-    camera_model_evidence,
+from stages.effects.scene_statistics import (
+    camera_model_statistic,
+    classify_poses,
+    classify_rolling_shutter,
     observed_places,
-    pose_statistic,
-    rolling_shutter_statistic,
     unless_pixels_differ,
 )
 from stages.effects.study import Clock
@@ -25,7 +25,7 @@ VIEWS, POINTS = 10, 120
 
 def geometric(
     folder: Path, width: int, shift: float, readout: float = 0.0, turned: bool = False
-) -> dict[str, Evidence]:
+) -> dict[str, Statistic]:
     """Frames of a video, 3:4, or 4:3 of a camera that was ``turned``, whose points are off by ``shift`` of the width,
     each frame in another direction, and by the motion that a readout of this part of a frame makes; poses are stated to
     be uncertain by half a thousandth."""
@@ -61,7 +61,7 @@ def geometric(
         (camera,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), False, False, "object-centric", True
     )
     places = observed_places(folder, scene, points, {view.file: width / 2000 for view in views})
-    return {"pose_refinement": pose_statistic(places), "rolling_shutter": rolling_shutter_statistic(places)}
+    return {"pose_refinement": classify_poses(places), "rolling_shutter": classify_rolling_shutter(places)}
 
 
 def test_what_serves_several_effects_is_shared_out_among_them(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,7 +83,7 @@ def test_what_serves_several_effects_is_shared_out_among_them(monkeypatch: pytes
 def test_pose_errors_are_scaled_to_a_thousand_pixels(tmp_path: Path, shift: float, called_for: bool | None) -> None:
     found = [geometric(tmp_path / str(width), width, shift)["pose_refinement"] for width in (800, 4000)]
     for one in found:
-        assert one.statistic == pytest.approx(max(1000 * shift, 0.5), rel=0.05) and one.called_for is called_for
+        assert one.value == pytest.approx(max(1000 * shift, 0.5), rel=0.05) and one.called_for is called_for
         assert one.unit == "px at 1000" and one.words.startswith("at 1000 pixels a quarter of the photos are off by ")
         assert one.words.endswith("; poses uncertain by 0.5 px")
 
@@ -91,7 +91,7 @@ def test_pose_errors_are_scaled_to_a_thousand_pixels(tmp_path: Path, shift: floa
 def test_row_delays_are_scaled_to_a_thousand_pixels(tmp_path: Path) -> None:
     small, large = (geometric(tmp_path / str(width), width, 0.0, 0.5)["rolling_shutter"] for width in (800, 4000))
     assert small.called_for is large.called_for is True and small.unit == "px at 1000"
-    assert large.statistic == pytest.approx(small.statistic, rel=0.05)
+    assert large.value == pytest.approx(small.value, rel=0.05)
     assert large.words.startswith("rows take ") and " between frames, at 1000 pixels " in large.words
     assert geometric(tmp_path / "upright", 800, 0.0, 0.5, turned=True)["rolling_shutter"].called_for is True
     # eleven thousandths of the width are motion enough, however small the photo is: here they are 1.8 of its pixels
@@ -101,8 +101,8 @@ def test_row_delays_are_scaled_to_a_thousand_pixels(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seen", [True, False])
 @pytest.mark.parametrize("called_for", [True, None, False])
 def test_gains_across_distances_are_left_to_a_pilot(called_for: bool | None, seen: bool) -> None:
-    exposure = Evidence(0.2, "EV", 0.1, 0.01, called_for, "gains span 0.4 EV")
-    scale = Evidence(5.0 if seen else 2.0, "×", 4.0, 0.01, seen, "pixels differ")
+    exposure = Statistic(0.2, "EV", 0.1, 0.01, called_for, "gains span 0.4 EV")
+    scale = Statistic(5.0 if seen else 2.0, "×", 4.0, 0.01, seen, "pixels differ")
     found = unless_pixels_differ(exposure, scale)
     if called_for and seen:
         assert found.called_for is None and found.words.startswith("gains span 0.4 EV; photos from such different")
@@ -125,16 +125,16 @@ def test_lenses_compare_with_their_groups_simplest_sound_one() -> None:
         candidate(1, "SIMPLE_RADIAL", 0.55, chosen=True),
         candidate(1, "OPENCV", 0.54),
     ]
-    found = camera_model_evidence({"source": "sfm", "camera_models": rows})
-    assert found.statistic == pytest.approx(0.3) and found.called_for is True
+    found = camera_model_statistic({"source": "sfm", "camera_models": rows})
+    assert found.value == pytest.approx(0.3) and found.called_for is True
     assert found.words == ("OPENCV: held-out error 0.3 px below that of the simplest candidate, SIMPLE_RADIAL: 0.1 px")
-    alone = camera_model_evidence({"source": "sfm", "camera_models": rows[3:]})
+    alone = camera_model_statistic({"source": "sfm", "camera_models": rows[3:]})
     assert alone.words == "SIMPLE_RADIAL: held-out error 0.1 px below that of the simplest candidate"
 
 
 def test_a_pinhole_is_no_lens() -> None:
-    found = camera_model_evidence({"source": "sfm", "camera_models": [candidate(0, "PINHOLE", 0.5, chosen=True)]})
-    assert found.called_for is False and found.statistic == 0
+    found = camera_model_statistic({"source": "sfm", "camera_models": [candidate(0, "PINHOLE", 0.5, chosen=True)]})
+    assert found.called_for is False and found.value == 0
 
 
 @pytest.mark.parametrize(
@@ -146,6 +146,6 @@ def test_a_pinhole_is_no_lens() -> None:
     ],
 )
 def test_why_nothing_is_known_of_the_lens(source: str, rows: list[dict[str, Any]], why: str) -> None:
-    found = camera_model_evidence({"source": source, "camera_models": rows})
+    found = camera_model_statistic({"source": source, "camera_models": rows})
     assert found.words == f"{why}: nothing known" and found.called_for is False
     assert np.isinf(found.noise) and np.isinf(found.threshold)

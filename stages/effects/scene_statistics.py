@@ -6,24 +6,24 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from nerf.effects.statistics.background import background_evidence, untracked_share
-from nerf.effects.statistics.exposure import ExposureFit, exposure_evidence, fit_exposure
+from nerf.effects.statistics.background import background_statistic, untracked_share
+from nerf.effects.statistics.exposure import ExposureFit, exposure_statistic, fit_exposure
 from nerf.effects.statistics.outlier_images import OutlierImages, outlier_images
-from nerf.effects.statistics.poses import common_residuals, pose_evidence
-from nerf.effects.statistics.statistic import Evidence, unknown
+from nerf.effects.statistics.poses import common_residuals, pose_statistic
+from nerf.effects.statistics.statistic import Statistic, unknown
 from nerf.effects.statistics.tracks import TrackColours
-from nerf.effects.statistics.vignetting import vignetting_evidence
+from nerf.effects.statistics.vignetting import vignetting_statistic
 from nerf.effects.statistics.warnings import (
     across_rows,
     motion_to_next,
-    participating_media_evidence,
-    rolling_shutter_evidence,
-    scale_variation_evidence,
-    tone_evidence,
-    transients_evidence,
+    participating_media_statistic,
+    rolling_shutter_statistic,
+    scale_variation_statistic,
+    tone_statistic,
+    transients_statistic,
 )
 from stages.contract import Progress
-from stages.effects.track_colours import look_at_photos
+from stages.effects.track_colours import sample_photos
 from stages.io.photos import read_photos
 from stages.sfm.colmap.cameras import project
 
@@ -70,7 +70,7 @@ def observed(
     progress: Progress,
 ) -> Observations:
     """What photos and tracks show."""
-    looked = look_at_photos(ingest, scene, points, progress)
+    looked = sample_photos(ingest, scene, points, progress)
     progress.update("fitting the photos' exposures")
     exposure = fit_exposure(looked.tracks)
     return Observations(
@@ -105,10 +105,10 @@ def observed_places(
     )
 
 
-def exposure_statistic(seen: Observations) -> Evidence:
+def classify_exposure(seen: Observations) -> Statistic:
     """The deviation of gains over the photos, outliers aside."""
-    found = exposure_evidence(seen.exposure, seen.exif_ev, seen.outliers.much)
-    return unless_pixels_differ(found, scale_variation_evidence(seen.tracks))
+    found = exposure_statistic(seen.exposure, seen.exif_ev, seen.outliers.much)
+    return unless_pixels_differ(found, scale_variation_statistic(seen.tracks))
 
 
 def measured_gains(seen: Observations) -> np.ndarray:
@@ -117,40 +117,40 @@ def measured_gains(seen: Observations) -> np.ndarray:
     return np.round(seen.exposure.log_gain, GAIN_DIGITS) + 0.0  # no -0
 
 
-def background_statistic(places: Places) -> Evidence:
+def classify_background(places: Places) -> Statistic:
     """What lies beyond the region, and where no tracks are."""
     untracked = untracked_share(places.xy / places.size[places.view], places.view, places.views)
-    return background_evidence(places.xyz, places.point, places.has_alpha, untracked)
+    return background_statistic(places.xyz, places.point, places.has_alpha, untracked)
 
 
-def pose_statistic(places: Places) -> Evidence:
+def classify_poses(places: Places) -> Statistic:
     """How far photos are from where their pose puts them."""
     common = common_residuals(places.residual_px, places.xy, places.view, places.views)
-    return pose_evidence(*common, places.uncertainty_px)
+    return pose_statistic(*common, places.uncertainty_px)
 
 
-def rolling_shutter_statistic(places: Places) -> Evidence:
+def classify_rolling_shutter(places: Places) -> Statistic:
     """Of the frames of a video."""
     motion = np.full((places.views, 2), np.nan)
     if places.frame is not None:
         usual = REFERENCE_PX / places.size.max(axis=1)
         motion = motion_to_next(places.xy * usual[places.view, None], places.point, places.view, places.frame)
     row = across_rows(places.xy, places.size[places.view])
-    return rolling_shutter_evidence(places.residual_px, row, motion, places.view)
+    return rolling_shutter_statistic(places.residual_px, row, motion, places.view)
 
 
 # What is seen and not modelled.
-WARNINGS: dict[str, Callable[[Observations], Evidence]] = {
-    "tone": lambda seen: tone_evidence(seen.exposure),
-    "vignetting": lambda seen: vignetting_evidence(seen.tracks, seen.exposure),
-    "transients": lambda seen: transients_evidence(seen.outliers, seen.exposure),
-    "scale_variation": lambda seen: scale_variation_evidence(seen.tracks),
-    "rolling_shutter": lambda seen: rolling_shutter_statistic(seen.places),
-    "participating_media": lambda seen: participating_media_evidence(seen.tracks, seen.exposure),
+WARNINGS: dict[str, Callable[[Observations], Statistic]] = {
+    "tone": lambda seen: tone_statistic(seen.exposure),
+    "vignetting": lambda seen: vignetting_statistic(seen.tracks, seen.exposure),
+    "transients": lambda seen: transients_statistic(seen.outliers, seen.exposure),
+    "scale_variation": lambda seen: scale_variation_statistic(seen.tracks),
+    "rolling_shutter": lambda seen: classify_rolling_shutter(seen.places),
+    "participating_media": lambda seen: participating_media_statistic(seen.tracks, seen.exposure),
 }
 
 
-def unless_pixels_differ(exposure: Evidence, scale: Evidence) -> Evidence:
+def unless_pixels_differ(exposure: Statistic, scale: Statistic) -> Statistic:
     """What is told of exposure, left to a pilot where ``scale`` is seen: coarse pixels average what fine ones tell
     apart, by which the gains of photos from very different distances differ, too (docs/experiments/effects.md)."""
     if not (exposure.called_for and scale.called_for):
@@ -165,7 +165,7 @@ def told_exposures(ingest: Path, scene: "Scene") -> np.ndarray:
     return np.array([told.get(view.file) for view in scene.of_split("train")], float)  # None becomes NaN
 
 
-def camera_model_evidence(registration: dict[str, Any]) -> Evidence:
+def camera_model_statistic(registration: dict[str, Any]) -> Statistic:
     """The choice that stage sfm made by held-out reprojection error, shown beside the others."""
     rows = registration.get("camera_models") or []
     chosen = [row for row in rows if row["chosen"]]
@@ -180,7 +180,7 @@ def camera_model_evidence(registration: dict[str, Any]) -> Evidence:
     words = f"{first['model']}: held-out error {most:.2g} px below that of the simplest candidate"
     words += "".join(f", {row['model']}: {gain:.2g} px" for gain, row in others)
     noise = first["noise_px"]
-    return Evidence(most, "px", noise, noise, any(row["model"] not in PINHOLES for row in chosen), words)
+    return Statistic(most, "px", noise, noise, any(row["model"] not in PINHOLES for row in chosen), words)
 
 
 def _is_video(ingest: Path, files: Sequence[str]) -> bool:
