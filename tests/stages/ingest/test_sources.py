@@ -16,6 +16,7 @@ from stages.ingest.sources import (
     camera_files,
     find_source,
     is_gone,
+    mask_beside,
     photos_beside,
     unused_cameras,
     unused_masks,
