@@ -47,6 +47,11 @@ def share_without_ray(model: pycolmap.Camera) -> float:
     return _ray_directions(model, pixels)[1] / len(pixels)
 
 
+def ray_directions(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    """Unit ray directions of pixels of the camera's own size; where it has no inverse, those of other pixels or NaN."""
+    return _ray_directions(native(camera), pixels)[0]
+
+
 def _ray_directions(model: pycolmap.Camera, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], int]:
     """Unit ray directions of pixels, and how many of these they are not those of."""
     ray_directions = np.asarray(model.cam_ray_from_img(pixels))
