@@ -70,10 +70,6 @@ CASES = [
     Case(
         formula="vignetting s(exp(−p(u)) s⁻¹(c))",
         where="nerf/effects/vignetting.py: forward, backward, falloff_terms",
-        domain="unit directions; log gains within ±16",
-        hazard="1 − cos θ cancels beside the axis; exp(g) s⁻¹(c) overflows for colours of 1e15",
-        answer="|d − axis|² in its place; from one power law to the other, without linear light in between",
-        tried="angles to the corner, up to 2 EV; the axis, the corner, behind; black to 1e10; 23 stops",
         typical=lambda: (
             decades(1, -3, 0, 256, 3),
             uniform(2, 0, 0.5, 256, 3),
