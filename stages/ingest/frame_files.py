@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from itertools import product, takewhile
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
-from urllib.parse import unquote
 
 from stages.contract import StageError, listed
 from stages.ingest.listing import IMAGES, walk_photos
@@ -167,9 +166,16 @@ def _ambiguous(name: str, what: str, root: Path, found: Sequence[Path]) -> Stage
 def _as_paths(name: str) -> tuple[str, ...]:
     """``name`` as it stands, with the slashes of Windows turned, and as the URL that it may be."""
     if name.startswith("file://"):
-        return (unquote(name.removeprefix("file://")),)
+        return (_decoded(name.removeprefix("file://")),)
     turned = name.replace("\\", "/")
-    return name, turned, unquote(turned)
+    return name, turned, _decoded(turned)
+
+
+def _decoded(url: str) -> str:
+    """A URL's path with what it writes as %20 and the like (RFC 3986)."""
+    return re.sub(
+        r"(%[\da-fA-F]{2})+", lambda part: bytes.fromhex(part[0].replace("%", "")).decode("utf-8", "replace"), url
+    )
 
 
 def _relative(name: str, folders: tuple[Path, ...]) -> str | None:

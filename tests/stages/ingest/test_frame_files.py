@@ -136,6 +136,13 @@ def test_paths_may_be_urls(tmp_path: Path, written: str) -> None:
     assert list(source.frames.values()) == ["images/photo 1 é.jpg", "images/100%25.jpg"]
 
 
+def test_a_url_leads_out_of_no_folder(tmp_path: Path) -> None:
+    touch(tmp_path, "secret.jpg", "set/b.jpg")
+    assert refusal(transforms(tmp_path / "set/transforms.json", "b.jpg", "%2e%2e/secret.jpg")).code == (
+        "ingest.outside-folder"
+    )
+
+
 def test_photos_of_another_ending_are_taken_where_none_is_there(tmp_path: Path) -> None:
     touch(tmp_path, "images/0.jpg", "images/1.jpg", "images/2.tif")
     written = ["images/0.png", "images/1.png", "images/2.png"]
