@@ -130,7 +130,7 @@ def test_a_diverging_pilot_leaves_the_effect(decided: Callable) -> None:
 
     decisions, table, *_ = decided(effects.Config(), 1.0, diverging, exposure=found(None))
     assert "exposure" not in decisions.on
-    assert table["exposure"]["reason"].endswith("not clear, and the pilot diverged: the loss of step 3 is not finite")
+    assert table["exposure"]["reason"].endswith("unclear, and the pilot diverged: the loss of step 3 is not finite")
 
 
 def test_without_pilots_the_grey_zone_follows_publication(decided: Callable) -> None:
