@@ -85,7 +85,7 @@ def bench_of(workspace: Path) -> Bench:
     shown_over = torch.tensor(field_background(config, scene))
     pixels = sample_evaluation_pixels(test, EVALUATION_PIXELS, shown_over, seed=0)
     return Bench(
-        config, scene, decisions, train, pixels, held_out_images(scene.of_split("train"), scene.of_split("test"))
+        config, scene, decisions, train, pixels, held_out_images(scene, scene.of_split("train"), scene.of_split("test"))
     )
 
 
@@ -109,7 +109,7 @@ class RunningMean:
 
 def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, Any]:
     """One run, measured at geometric steps."""
-    effects = image_effects(bench.decisions, bench.scene.of_split("train"), bench.dataset)
+    effects = image_effects(bench.decisions, bench.scene, bench.scene.of_split("train"), bench.dataset)
     trainer = make_trainer(bench.config, bench.scene, bench.dataset, seed, effects)
     assert isinstance(trainer, HashGridTrainer)
     means = {name: RunningMean(trainer, exponent) for name, exponent in MEANS.items()}

@@ -71,7 +71,7 @@ def arms(
         return make_trainer(of_choice, scene, dataset, config.seed, effects)
 
     return {"off": trainer(none, identity)} | {
-        name: trainer(each, image_effects(each, views, dataset)) for name, each in choices.items()
+        name: trainer(each, image_effects(each, scene, views, dataset)) for name, each in choices.items()
     }
 
 

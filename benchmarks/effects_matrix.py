@@ -54,7 +54,10 @@ CELLS = {
     "highlights, alpha": cell(Effects(highlight=MIRROR, alpha=True)),
     "highlights, poses": cell(Effects(highlight=MIRROR, jitter_px=3.0), "background pose_refinement"),
     "poses, alpha": cell(Effects(jitter_px=3.0, alpha=True), "pose_refinement"),
-    "vignetting": cell(Effects(vignetting_ev=1.0), "background", "vignetting"),
+    "vignetting": cell(Effects(vignetting_ev=1.0), "background vignetting"),
+    "exposure, vignetting": cell(Effects(exposure_ev=1.0, vignetting_ev=1.0), "background exposure vignetting"),
+    "vignetting, 0.3 EV": cell(Effects(vignetting_ev=0.3), "background"),
+    "exposure, vignetting, 0.3 EV": cell(Effects(exposure_ev=1.0, vignetting_ev=0.3), "background exposure"),
     "passers-by": cell(Effects(strangers=0.15), "background", "transients"),
     "4 × distance": cell(Effects(farther=4.0), "background", "scale_variation"),
 }
@@ -88,7 +91,7 @@ def gains(found: Outcome, wanted: Cell, steps: int) -> str:
     trial = pilot_scene(found.inputs, read_scene(found.inputs["normalise"]), SilentDisplay())
     assert not isinstance(trial, str), trial
     called_for = (wanted.on & found.on) | ({"view_dependence"} if wanted.made.highlight else set())
-    tried, parts = ["exposure", "pose_refinement", "view_dependence"], []
+    tried, parts = ["exposure", "pose_refinement", "vignetting", "view_dependence"], []
     if found.made == Effects():
         tried.append("background")
     for name in tried:

@@ -24,7 +24,7 @@ from benchmarks.nerfacto import pipeline, stage_folder
 from benchmarks.record import Record, add_out
 from stages.io.files import read_json
 
-EFFECTS = ("exposure", "view_dependence", "background", "pose_refinement")
+EFFECTS = ("exposure", "view_dependence", "background", "pose_refinement", "vignetting")
 FIGURES = {"raw": "psnr", "fitted": "psnr_exposure_fitted", "posed": "psnr_pose_fitted"}
 JUDGED_BY = {"pose_refinement": "posed"}  # the others: raw
 TOLERATED = 0.3  # dB

@@ -79,7 +79,7 @@ def prepared(workspace: Path, asked: Config) -> tuple[Config, FieldTrainer]:
     which are printed."""
     config, scene, dataset, decisions = loaded(workspace, asked)
     return config, make_trainer(
-        config, scene, dataset, config.seed, image_effects(decisions, scene.of_split("train"), dataset)
+        config, scene, dataset, config.seed, image_effects(decisions, scene, scene.of_split("train"), dataset)
     )
 
 

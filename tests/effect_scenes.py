@@ -3,6 +3,7 @@ tracks of the demo's still life, without structure from motion."""
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +55,7 @@ def effect_scene(folder: Path, effects: Effects, seed: int = 0, views: int = 24)
     poses[1::2, :, 3] *= effects.farther
     photos = [f"{index:03d}.png" for index in range(views)]
     for name, pose in zip(photos, poses, strict=True):
-        picture = _photo(world, pose, effects, random)
+        picture = _photo(world, pose, _plain_photo(seed, effects.highlight, pose.tobytes()), effects, random)
         Image.fromarray(picture).save(inputs["ingest"] / "images" / name, compress_level=1)
     about = [Photo(n, f"images/{n}", WIDTH, HEIGHT, 0, None, None, effects.alpha, 1.0) for n in photos]
     write_photos(inputs["ingest"], about, [], {})
@@ -66,22 +67,29 @@ def effect_scene(folder: Path, effects: Effects, seed: int = 0, views: int = 24)
     return inputs
 
 
-def _photo(world: SyntheticScene, pose: np.ndarray, effects: Effects, random: np.random.Generator) -> np.ndarray:
+@lru_cache(maxsize=128)  # photos of five scenes: they take longer than all that is done with them
+def _plain_photo(seed: int, highlight: float, pose: bytes) -> torch.Tensor:
+    """A photo of ``still_life(seed, highlight)`` without any effect, (height, width, 3)."""
+    matrix = torch.tensor(np.frombuffer(pose).reshape(3, 4), dtype=torch.float32)
+    return photograph(still_life(seed, highlight), pinhole_directions(2 * WIDTH, 2 * HEIGHT, 2 * FOCAL), matrix, 2)
+
+
+def _photo(
+    world: SyntheticScene, pose: np.ndarray, plain: torch.Tensor, effects: Effects, random: np.random.Generator
+) -> np.ndarray:
     """One photo, (height, width, 3 or 4) uint8."""
-    matrix = torch.tensor(pose, dtype=torch.float32)
-    fine = pinhole_directions(2 * WIDTH, 2 * HEIGHT, 2 * FOCAL)
-    colour = photograph(world, fine, matrix, 2)
     gain = math.log(2) * random.uniform(-effects.exposure_ev, effects.exposure_ev)
     across, down = (np.arange(WIDTH) + 0.5) / WIDTH - 0.5, (np.arange(HEIGHT) + 0.5) / HEIGHT - 0.5
     square = (across[None, :] * WIDTH) ** 2 + (down[:, None] * HEIGHT) ** 2
     falling = -math.log(2) * effects.vignetting_ev * square / (WIDTH**2 + HEIGHT**2) * 4
-    colour = expose(colour, torch.tensor(gain + falling, dtype=torch.float32)[..., None].expand_as(colour))
+    colour = expose(plain, torch.tensor(gain + falling, dtype=torch.float32)[..., None].expand_as(plain))
     if random.uniform() < effects.strangers:
         left, top = random.integers(0, WIDTH // 2), random.integers(0, HEIGHT // 3)
         colour[top : top + 2 * HEIGHT // 3, left : left + WIDTH // 4] = torch.tensor(random.uniform(size=3)).float()
     pixels = (255 * colour.clamp(0, 1)).round().byte().numpy()
     if not effects.alpha:
         return pixels
+    matrix = torch.tensor(pose, dtype=torch.float32)
     hit = world.trace(_rays(pinhole_directions(WIDTH, HEIGHT, FOCAL), matrix)).hit
     return np.concatenate([pixels, 255 * hit.numpy()[..., None].astype(np.uint8)], axis=2)
 

@@ -4,9 +4,9 @@ An image has a tuple of ray effects (its camera model: where its rays run) and a
 model: what it shows of the scene), applied in order. :class:`ImageEffects` holds both and composes them; without any it
 is the identity, which computes nothing and changes no bit.
 
-Parameters have a row per image of the ray dataset and are updated in place by the trainer. ``forward`` is plain torch,
-which autograd may differentiate (the vanilla NeRF's trainer does so); the backward methods are its derivative by hand
-(the hash-grid trainer has no autograd) and give dense gradients of the parameters by name.
+Parameters have a row per image of the ray dataset, or per camera, and are updated in place by the trainer. ``forward``
+is plain torch, which autograd may differentiate (the vanilla NeRF's trainer does so); the backward methods are its
+derivative by hand (the hash-grid trainer has no autograd) and give dense gradients of the parameters by name.
 """
 
 from collections.abc import Callable
@@ -29,10 +29,13 @@ class RayGradients(NamedTuple):
 
 
 class Images(NamedTuple):
-    """What effects may know of images: their calibrated poses, and how far away (scene units) is what each of them
-    shows; None: nobody knows."""
+    """What effects may know of images: their calibrated poses, the number of the ``camera`` that took each of them, how
+    far its ``corner`` is from the optical axis (4 sin²(θ/2) of the largest angle θ), and how far away (scene units) is
+    what each of them shows; None: nobody knows."""
 
     scene_from_camera: Float[Tensor, "views 3 4"]
+    camera: Int[Tensor, "views"]
+    corner: Float[Tensor, "views"]
     viewing_distance: Float[Tensor, "views"] | None = None
 
 
@@ -61,8 +64,8 @@ class RayEffect(Protocol):
     learning_rate: ClassVar[float]
 
     @property
-    def parameters(self) -> dict[str, Float[Tensor, "views _"]]:
-        """What is learnt with the field."""
+    def parameters(self) -> dict[str, Float[Tensor, "_ _"]]:
+        """What is learnt with the field: a row per image or per camera."""
         ...
 
     @property
@@ -106,8 +109,8 @@ class ColourEffect(Protocol):
     held_out_words: ClassVar[str]
 
     @property
-    def parameters(self) -> dict[str, Float[Tensor, "views _"]]:
-        """What is learnt with the field."""
+    def parameters(self) -> dict[str, Float[Tensor, "_ _"]]:
+        """What is learnt with the field: a row per image or per camera."""
         ...
 
     @property
@@ -173,7 +176,7 @@ class ImageEffects(NamedTuple):
         return (*self.rays, *self.colours)
 
     @property
-    def parameters(self) -> dict[str, Float[Tensor, "views _"]]:
+    def parameters(self) -> dict[str, Float[Tensor, "_ _"]]:
         """By effect and name, like ``exposure.log_gain``."""
         return {name: each for effect in self.all for name, each in parameters_of(effect).items()}
 
@@ -245,7 +248,7 @@ class ImageEffects(NamedTuple):
 NO_EFFECTS = ImageEffects()
 
 
-def parameters_of(effect: Effect) -> dict[str, Float[Tensor, "views _"]]:
+def parameters_of(effect: Effect) -> dict[str, Float[Tensor, "_ _"]]:
     """An effect's parameters by the names that they have among all."""
     return _named(effect, effect.parameters)
 

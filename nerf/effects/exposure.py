@@ -102,7 +102,7 @@ class ExposureModel:
         return of_colour, {"log_gain": torch.zeros_like(self.log_gain).index_add_(0, view, of_gain)}
 
 
-def expose(colour: Float[Tensor, "*n 3"], log_gain: Float[Tensor, "*#n 3"]) -> Float[Tensor, "*n 3"]:
+def expose(colour: Float[Tensor, "*n 3"], log_gain: Float[Tensor, "*#n #3"]) -> Float[Tensor, "*n 3"]:
     """What a photo of gain exp(``log_gain``) shows of sRGB colours, s(exp(g) s⁻¹(c)); not clipped above 1.
 
     expose(c, 0) is c, bit for bit. Colours below 0 count as 0, gains beyond MAX_LOG_GAIN as that.
@@ -111,8 +111,8 @@ def expose(colour: Float[Tensor, "*n 3"], log_gain: Float[Tensor, "*#n 3"]) -> F
 
 
 def expose_backward(
-    colour: Float[Tensor, "*n 3"], log_gain: Float[Tensor, "*#n 3"], grad: Float[Tensor, "*n 3"]
-) -> tuple[Float[Tensor, "*n 3"], Float[Tensor, "*#n 3"]]:
+    colour: Float[Tensor, "*n 3"], log_gain: Float[Tensor, "*#n #3"], grad: Float[Tensor, "*n 3"]
+) -> tuple[Float[Tensor, "*n 3"], Float[Tensor, "*#n #3"]]:
     """Gradients of a loss by the colours and the log gains, given that by what :func:`expose` shows."""
     done = _branches(colour, log_gain)
     by_gain = _slope(done, _shown(done))

@@ -153,8 +153,9 @@ def command_run(words: Sequence[str]) -> int:
         force = frozenset(stages[stages.index(_known_stage(given.from_, "--from", stages)) :])
     budget = _budget(given.budget, asked)
     if budget is not None and (studies := [stage for stage in stages if stage_list.is_on_request(stage)]):
-        later = f"`pipeline {studies[0]} {root} --budget 30m`"
-        raise UsageError(f"--budget and --until {studies[0]}: a study has a budget of its own; run first, then {later}")
+        stage = studies[0]
+        what = f"{stage} is no part of a budget and has a time of its own (--{stage}.seconds)"
+        raise UsageError(f"--budget and --until {stage}: {what}; run first, then `pipeline {stage} {root}`")
     with choose_display(given.common.json) as display:
         try:
             asked = with_source(asked, given.photos, cameras)

@@ -21,7 +21,7 @@ from stages.io.amounts import duration
 from stages.io.files import read_json, read_scene
 
 INPUTS = ("ingest", "sfm", "normalise")
-VERSION = 14
+VERSION = 15
 EXIT_CODE = 13
 RESUMES = False
 PUBLISHED = ("effects.json",)

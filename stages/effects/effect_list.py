@@ -49,6 +49,16 @@ def _exposure() -> EffectParts:
     return EffectParts(classify_exposure, measured_gains, colours=ExposureModel)
 
 
+def _vignetting() -> EffectParts:
+    from nerf.effects.statistics.vignetting import vignetting_statistic
+    from nerf.effects.vignetting import VignettingModel
+    from stages.effects.scene_statistics import measured_vignetting
+
+    return EffectParts(
+        lambda seen: vignetting_statistic(seen.tracks, seen.exposure), measured_vignetting, colours=VignettingModel
+    )
+
+
 def _pose_refinement() -> EffectParts:
     from nerf.effects.pose_refinement import PoseRefinement
     from stages.effects.scene_statistics import classify_poses
@@ -65,8 +75,9 @@ def _view_dependence() -> EffectParts:
 EFFECTS = [
     Effect("background", "space beyond the region of interest, contracted", _background),
     Effect("exposure", "a gain per photo and colour channel", _exposure),
-    # Poses before view dependence: there are two A/B runs, and wrong poses cost more.
+    # Poses before the others: there are two A/B runs, and wrong poses cost more.
     Effect("pose_refinement", "a rigid correction of each photo's camera", _pose_refinement),
+    Effect("vignetting", "less light towards the corners of each camera", _vignetting),
     Effect(
         "view_dependence", "colour that depends on the viewing direction", _view_dependence, part_of_the_method=True
     ),

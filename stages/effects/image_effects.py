@@ -17,12 +17,13 @@ from nerf.geometry.scene import Scene, View
 from nerf.training.ray_dataset import RayDataset
 from stages.effects.decisions import Decisions
 from stages.effects.effect_list import EFFECTS
+from stages.sfm.colmap.cameras import corner_chord_squared
 
 
-def image_effects(decisions: Decisions, views: Sequence[View], dataset: RayDataset) -> ImageEffects:
+def image_effects(decisions: Decisions, scene: Scene, views: Sequence[View], dataset: RayDataset) -> ImageEffects:
     """What stands between the field and the photos ``views`` of ``dataset``, in their order."""
     rays, colours = [], []
-    images = images_of(views, dataset.device)._replace(viewing_distance=dataset.viewing_distance)
+    images = images_of(scene, views, dataset.device)._replace(viewing_distance=dataset.viewing_distance)
     for effect in EFFECTS:
         if effect.name not in decisions.on:
             continue
@@ -35,19 +36,24 @@ def image_effects(decisions: Decisions, views: Sequence[View], dataset: RayDatas
     return ImageEffects(tuple(rays), tuple(colours))
 
 
-def images_of(views: Sequence[View], device: torch.device | str = "cpu") -> Images:
+def images_of(scene: Scene, views: Sequence[View], device: torch.device | str = "cpu") -> Images:
     """What effects may know of photos."""
-    poses = np.stack([view.scene_from_camera for view in views])
-    return Images(torch.tensor(poses, dtype=torch.float32, device=device))
+    poses, camera = np.stack([view.scene_from_camera for view in views]), [view.camera for view in views]
+    corners = {number: corner_chord_squared(scene.cameras[number]) for number in set(camera)}
+    return Images(
+        torch.tensor(poses, dtype=torch.float32, device=device),
+        torch.tensor(camera, device=device),
+        torch.tensor([corners[number] for number in camera], dtype=torch.float32, device=device),
+    )
 
 
 def held_out_images(
-    trained: Sequence[View], held_out: Sequence[View], device: torch.device | str = "cpu"
+    scene: Scene, trained: Sequence[View], held_out: Sequence[View], device: torch.device | str = "cpu"
 ) -> HeldOutImages:
     """Photos that took no part in training, beside those that did."""
     poses, known = (np.stack([view.scene_from_camera for view in views]) for views in (held_out, trained))
     weights = torch.tensor(neighbour_weights(poses, known), dtype=torch.float32, device=device)
-    return HeldOutImages(images_of(held_out, device), weights)
+    return HeldOutImages(images_of(scene, held_out, device), weights)
 
 
 def refines_poses(names: Collection[str]) -> bool:
@@ -75,12 +81,12 @@ class LearntColours(NamedTuple):
         """As it was learnt of a photo, or as it is expected of one that took no part in training."""
         if view.name in self.photos:
             row = torch.tensor([self.photos[view.name]], dtype=torch.float32, device=device)
-            return self.model.restored(images_of([view], device), row)
+            return self.model.restored(images_of(scene, [view], device), row)
         # A target sets some of the training photos aside.
         trained = [known for known in scene.of_split("train") if known.name in self.photos]
         rows = torch.tensor([self.photos[known.name] for known in trained], dtype=torch.float32, device=device)
-        learnt = self.model.restored(images_of(trained, device), rows)
-        return learnt.of_held_out(held_out_images(trained, [view], device))
+        learnt = self.model.restored(images_of(scene, trained, device), rows)
+        return learnt.of_held_out(held_out_images(scene, trained, [view], device))
 
 
 def learnt_colours(field: dict[str, Any]) -> list[LearntColours]:

@@ -166,7 +166,7 @@ def _noise(gains: list[list[float]]) -> float:
 def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> _Trained:
     """A hash-grid field after ``steps`` steps under the decisions of one arm."""
     views = trial.scene.of_split("train")
-    effects = image_effects(arm, views, trial.dataset)
+    effects = image_effects(arm, trial.scene, views, trial.dataset)
     config = _config(arm, trial.scene, steps, trial.dataset.device.type)
     trainer = make_trainer(config, trial.scene, trial.dataset, seed, effects)
     for step in range(steps):

@@ -12,7 +12,7 @@ from nerf.effects.statistics.outlier_images import OutlierImages, outlier_images
 from nerf.effects.statistics.poses import common_residuals, pose_statistic
 from nerf.effects.statistics.statistic import Statistic, unknown
 from nerf.effects.statistics.tracks import TrackColours
-from nerf.effects.statistics.vignetting import vignetting_statistic
+from nerf.effects.statistics.vignetting import vignetting_slope
 from nerf.effects.statistics.warnings import (
     across_rows,
     motion_to_next,
@@ -117,6 +117,13 @@ def measured_gains(seen: Observations) -> np.ndarray:
     return np.round(seen.exposure.log_gain, GAIN_DIGITS) + 0.0  # no -0
 
 
+def measured_vignetting(seen: Observations) -> np.ndarray:
+    """The coefficients (views, 3) of nerf/effects/vignetting.py, equal ones, which make the slope over the squared
+    radius that all cameras have in common; rounded like gains."""
+    falling = max(-vignetting_slope(seen.tracks, seen.exposure)[0], 0.0)
+    return np.full((seen.tracks.views, 3), round(falling / 3, GAIN_DIGITS))
+
+
 def classify_background(places: Places) -> Statistic:
     """What lies beyond the region, and where no tracks are."""
     untracked = untracked_share(places.xy / places.size[places.view], places.view, places.views)
@@ -142,7 +149,6 @@ def classify_rolling_shutter(places: Places) -> Statistic:
 # What is seen and not modelled.
 WARNINGS: dict[str, Callable[[Observations], Statistic]] = {
     "tone": lambda seen: tone_statistic(seen.exposure),
-    "vignetting": lambda seen: vignetting_statistic(seen.tracks, seen.exposure),
     "transients": lambda seen: transients_statistic(seen.outliers, seen.exposure),
     "scale_variation": lambda seen: scale_variation_statistic(seen.tracks),
     "rolling_shutter": lambda seen: classify_rolling_shutter(seen.places),

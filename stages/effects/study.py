@@ -204,7 +204,7 @@ def _finite(value: float) -> float | None:
 
 
 def _line(table: dict[str, dict[str, Any]]) -> str:
-    """exposure on (…) · view dependence on (…) · 2 off · seen, not modelled: vignetting (…)."""
+    """exposure on (…) · view dependence on (…) · 2 off · seen, not modelled: tone (…)."""
     modelled = {name.replace("_", " "): entry for name, entry in table.items() if entry["modelled"]}
     on = [f"{name} on ({entry['reason']})" for name, entry in modelled.items() if entry["on"]]
     seen = [f"{n.replace('_', ' ')} ({e['reason']})" for n, e in table.items() if not e["modelled"] and e["on"]]

@@ -21,6 +21,9 @@ _PERHAPS = re.compile(
 )
 _COLOUR = re.compile(r"(.+)[ ._-](colou?r|rgb|image)", re.IGNORECASE)  # a.color.jpg beside a.depth.png
 IGNORED = "dynamic_mask_"  # instant-ngp's masks, beside their photos, whose white is ignored
+# One mask of what all photos show alike: a drone's leg, the rim of a fisheye.
+ONE_FOR_ALL, ALL_PHOTOS = ("mask", "masks", "camera_mask", "global_mask"), "all photos"
+_MARK = re.compile(r"[ ._-]masks?$|^masks?[ ._-]", re.IGNORECASE)
 _MASK = re.compile(r"(.+[ ._-])?masks?([ ._-]?\d+)?", re.IGNORECASE)
 
 # Of a depth map there is a photo, but for a few that were lost; of photos in grey there need not be any in colour.
@@ -32,7 +35,7 @@ _Key = tuple[PurePosixPath, str]  # a folder, and what a photo in it is called
 
 
 def auxiliary_files(names: Sequence[str]) -> dict[str, str]:
-    """{file: the photo that it belongs to}, all named relative to the photo folder."""
+    """{file: the photo that it belongs to}, all named relative to the photo folder; or ALL_PHOTOS."""
     files = [PurePosixPath(name) for name in names]
     photos: dict[_Key, PurePosixPath] = {}
     for file in files:
@@ -47,7 +50,8 @@ def auxiliary_files(names: Sequence[str]) -> dict[str, str]:
             found[str(file)] = str(photo)
         elif marks_ignored(file.name):  # of a photo that is not there
             found[str(file)] = file.stem.removeprefix(IGNORED)
-    return found
+    for_all = {str(file) for file in files if file.stem.lower() in ONE_FOR_ALL} - found.keys() - set(found.values())
+    return found | dict.fromkeys(for_all if for_all < set(names) - found.keys() else (), ALL_PHOTOS)
 
 
 def depth_maps(stored: Mapping[str, Stored]) -> set[str]:
@@ -73,18 +77,22 @@ def pair_masks(names: Sequence[str], masks: Sequence[tuple[str, Path]]) -> tuple
     once though it may stand for several names.
 
     A photo's mask is called after it, with its ending or without, and ends as images do, in .png rather than in another
-    way. Its accents may be composed in another way, where no other mask is called so.
+    way. Where no other mask is called so, its accents may be composed in another way, and it may say that it is a mask:
+    a_mask.png, mask_a.png.
     """
     by_name: dict[str, Path] = {}
     composed: dict[str, set[Path]] = {}
+    marked: dict[str, set[Path]] = {}
     for name, file in sorted(masks, key=lambda mask: not mask[0].lower().endswith(".png")):
         of, ending = os.path.splitext(name)
         if ending.lower() in IMAGES:
             by_name.setdefault(of, file)
             composed.setdefault(unicodedata.normalize("NFC", of), set()).add(file)
+            marked.setdefault(unicodedata.normalize("NFC", _unmarked(of)), set()).add(file)
 
     def mask_of(name: str) -> Path | None:
-        alike = composed.get(unicodedata.normalize("NFC", name), set())
+        key = unicodedata.normalize("NFC", name)
+        alike = composed.get(key) or marked.get(key, set())
         return by_name.get(name, next(iter(alike)) if len(alike) == 1 else None)
 
     found: dict[str, Path] = {}
@@ -95,6 +103,12 @@ def pair_masks(names: Sequence[str], masks: Sequence[tuple[str, Path]]) -> tuple
             found[name] = file
     used = set(found.values())
     return found, list(dict.fromkeys(file for _, file in masks if file not in used))
+
+
+def _unmarked(name: str) -> str:
+    """A mask's name without what says that it is one."""
+    folder, _, last = name.rpartition("/")
+    return f"{folder}/{_MARK.sub('', last)}".removeprefix("/")
 
 
 def is_mask(name: str) -> bool:

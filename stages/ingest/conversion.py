@@ -60,6 +60,7 @@ class _TakenMask:
     turned: bool
     resized: bool
     ambiguous: bool
+    grey: bool
 
 
 @dataclass(frozen=True)
@@ -155,15 +156,13 @@ def _take_all(
         return _take_video(source.files[0], max_frames, waiting, progress), [], []
     masks, strays = pair_masks([source.name(file) for file in source.files], source.masks)
     notes = messages.excluded(source.excluded)
-    notes += [
-        Note("ingest.stray-mask", f"{shown(f'masks/{file.name}')} is no photo's mask, which are called NAME.png")
-        for file in strays
-    ]
+    notes += messages.stray_masks([f"{file.parent.name}/{file.name}" for file in strays])
     stored = are_of_stored_pixels((file, masks[name]) for file in source.files if (name := source.name(file)) in masks)
     outcomes = _decode_all(source, masks, bool(stored), waiting, progress)
     taken = [outcome for outcome in outcomes if isinstance(outcome, _Taken)]
     if stored is None:
         notes += messages.taken_as_upright([photo.name for photo in taken if photo.mask and photo.mask.ambiguous])
+    notes += messages.grey_masks([photo.name for photo in taken if photo.mask and photo.mask.grey])
     return taken, [outcome for outcome in outcomes if isinstance(outcome, Rejection)], notes
 
 
@@ -261,7 +260,7 @@ def _take_mask(file: Path, photo: CameraKey, stored: bool, waiting: Path) -> _Ta
     if not ignored:
         return None
     write_png(waiting, mask.pixels)
-    return _TakenMask(waiting, ignored, small(mask.pixels), mask.turned, mask.resized, mask.ambiguous)
+    return _TakenMask(waiting, ignored, small(mask.pixels), mask.turned, mask.resized, mask.ambiguous, mask.grey)
 
 
 def _take_opaque(pixels: np.ndarray, mask: _TakenMask | None, waiting: Path) -> float | None:

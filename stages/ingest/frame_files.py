@@ -9,10 +9,11 @@ from itertools import product, takewhile
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
-from stages.contract import StageError
+from stages.contract import StageError, listed
 from stages.ingest.listing import IMAGES, walk_photos
 from stages.io.transforms_files import MAX_LETTERS, photo_names
 
+MAX_NAMES = 2  # in an error
 _EXTENSIONS_TRIED = ("", ".png", ".jpg", ".jpeg")
 
 # A name but for its ending, and the ending in small letters, None of an image, which may be called without.
@@ -25,10 +26,14 @@ class FrameFiles:
     listed once at most.
 
     ``of_other_folders``: the names are of another machine or folder, and only their ends tell which files are meant.
+    ``follows_links``: the first folder was given by the user, who may have put links to photos into it.
+    ``other_endings`` collects the names whose files are found by another ending, and these files.
     """
 
     folders: tuple[Path, ...]
     of_other_folders: bool = False
+    follows_links: bool = False
+    other_endings: dict[str, Path] = field(default_factory=dict, init=False)
     _photos: dict[tuple[str, ...], Path] = field(default_factory=dict, init=False)
     _listed: dict[Path, dict[_Spelling, list[str]]] = field(default_factory=dict, init=False)
     _by_last: dict[str, list[Path]] = field(default_factory=dict, init=False)
@@ -64,39 +69,66 @@ class FrameFiles:
 
     def _file(self, name: str, folders: tuple[Path, ...], what: str) -> Path:
         """The file that ``name`` stands for. A missing extension is completed; where there is no such file a name is
-        tried as Windows means it, with backslashes between folders, then in other spellings. One that leads out of the
-        folders is of another machine: its end tells which file is meant."""
-        relative = _relative(name, folders)
-        spellings = () if relative is None else dict.fromkeys((relative, relative.replace("\\", "/")))
+        tried as Windows or a URL means it, then in other spellings. One that leads out of the folders is of another
+        machine: its end tells which file is meant."""
+        relative = [_relative(spelling, folders) for spelling in _as_paths(name)]
+        spellings = list(dict.fromkeys(spelling for spelling in relative if spelling is not None))
         try:
             for spelling, folder, extension in product(spellings, folders, _EXTENSIONS_TRIED):
-                file = _inside(folder, self.folders[0], spelling + extension, what)
+                file = self._inside(folder, spelling + extension, what)
                 if file.is_file():
                     return file
             for spelling, folder in product(spellings, folders):
                 alike = self._alike(folder, spelling)
-                if alike is not None and (file := _inside(folder, self.folders[0], alike, what)).is_file():
+                if alike is not None and (file := self._inside(folder, alike, what)).is_file():
                     return file
-            if relative is not None and not self.of_other_folders:
-                return _inside(folders[0], self.folders[0], relative, what)
+            if relative[0] is not None and not self.of_other_folders:
+                return self._inside(folders[0], relative[0], what)
         except StageError:
-            if (found := self._by_end(name)) is None:
+            if (found := self._by_end(name, what)) is None:
                 raise
             return found
-        return self._by_end(name) or _inside(folders[0], self.folders[0], relative or name, what)
+        return self._by_end(name, what) or self._inside(folders[0], relative[0] or name, what)
 
-    def _by_end(self, name: str) -> Path | None:
+    def _by_end(self, name: str, what: str) -> Path | None:
         """The file in the first folder whose path has the longest end in common with ``name``, whatever its letters'
-        case; None where there is no such file, or more than one."""
+        case, and its ending where no other file is called so; None where there is no such file. Raises StageError where
+        there are several."""
+        root = self.folders[0]
         if not self._by_last:
-            for file in walk_photos(self.folders[0]):
+            for file in walk_photos(root):
                 for spelling in (file.name, file.stem) if file.suffix.lower() in IMAGES else (file.name,):
                     self._by_last.setdefault(_folded(spelling), []).append(file)
-        *above, last = [_folded(part) for part in PurePosixPath(name.replace("\\", "/")).parts]
-        found = self._by_last.get(last, [])
+        *above, last = [_folded(part) for part in PurePosixPath(_as_paths(name)[-1]).parts] or [""]
+        stem, ending = os.path.splitext(last)
+        found = self._by_last.get(last) or (self._by_last.get(stem, []) if ending in IMAGES else [])
+        found = [file for file in found if self.follows_links or file.resolve().is_relative_to(root.resolve())]
         alike = [_in_common(above, [_folded(part) for part in file.parent.parts]) for file in found]
         best = [file for file, count in zip(found, alike, strict=True) if count == max(alike)]
-        return best[0] if len(best) == 1 and best[0].resolve().is_relative_to(self.folders[0].resolve()) else None
+        if len(best) > 1:
+            raise _ambiguous(name, what, root, best)
+        if best and ending in IMAGES and ending != best[0].suffix.lower():
+            self.other_endings[name] = best[0]
+        return best[0] if best else None
+
+    def _inside(self, folder: Path, file_path: str, what: str) -> Path:
+        """The file of this name in ``folder``. Raises StageError where it leads out of there, but for a link to the
+        first folder, which the user gave, and for links in that to files."""
+        root = self.folders[0]
+        file = folder / os.path.normpath(file_path)
+        absolute, is_name = Path(file_path).is_absolute(), "\0" not in file_path
+        if is_name and not absolute:
+            inside = any(file.resolve().is_relative_to(place.resolve()) for place in (folder, root))
+            is_link = self.follows_links and file.is_symlink() and file.parent.resolve().is_relative_to(root.resolve())
+            if inside or is_link:
+                return file
+        of_photos = "Give the folder of the photos apart: pipeline run PHOTOS --cameras FILE"
+        raise StageError("ingest.outside-folder", 
+            f"rejected the {what} {file_path[:MAX_LETTERS]!r}",
+            "its path is absolute" if absolute else f"it leads out of the folder {folder}",
+            of_photos if what == "photo" and not self.follows_links else
+            f"A transforms file may name {what}s inside {root} only, and not in linked folders there.",
+        )  # fmt: skip
 
     def _alike(self, folder: Path, name: str) -> str | None:
         """What is in ``folder`` by another spelling of ``name``, relative to it: with the letters of its endings small
@@ -119,6 +151,31 @@ class FrameFiles:
         stem, ending = os.path.splitext(composed)
         entries = self._listed[folder]
         return entries.get((stem, ending.lower()), []) + entries.get((composed, None), [])
+
+
+def _ambiguous(name: str, what: str, root: Path, found: Sequence[Path]) -> StageError:
+    names = sorted(file.relative_to(root).as_posix() for file in found)
+    return StageError(
+        "ingest.ambiguous-path",
+        f"cannot tell which {what} {name[:MAX_LETTERS]!r} is",
+        f"it is no path in {root}, and the ends of {len(names)} files there fit it alike: {listed(names, MAX_NAMES)}",
+        f"Write the paths in the transforms file as they are in {root}, for example {names[0]}",
+    )
+
+
+def _as_paths(name: str) -> tuple[str, ...]:
+    """``name`` as it stands, with the slashes of Windows turned, and as the URL that it may be."""
+    if name.startswith("file://"):
+        return (_decoded(name.removeprefix("file://")),)
+    turned = name.replace("\\", "/")
+    return name, turned, _decoded(turned)
+
+
+def _decoded(url: str) -> str:
+    """A URL's path with what it writes as %20 and the like (RFC 3986)."""
+    return re.sub(
+        r"(%[\da-fA-F]{2})+", lambda part: bytes.fromhex(part[0].replace("%", "")).decode("utf-8", "replace"), url
+    )
 
 
 def _relative(name: str, folders: tuple[Path, ...]) -> str | None:
@@ -144,19 +201,3 @@ def _spellings_of(entry: str) -> Iterator[_Spelling]:
     yield stem, ending.lower()
     if ending.lower() in IMAGES:
         yield stem, None
-
-
-def _inside(folder: Path, root: Path, file_path: str, what: str) -> Path:
-    """The file of this name in ``folder``. Raises StageError where it leads out of there, but for a link to ``root``,
-    which the user gave."""
-    file = folder / os.path.normpath(file_path)
-    absolute, is_name = Path(file_path).is_absolute(), "\0" not in file_path
-    if absolute or not is_name or not any(file.resolve().is_relative_to(place.resolve()) for place in (folder, root)):
-        linked = is_name and what == "photo" and not absolute and ".." not in file.relative_to(folder).parts
-        raise StageError("ingest.outside-folder", 
-            f"rejected the {what} {file_path[:MAX_LETTERS]!r}",
-            "its path is absolute" if absolute else f"it leads out of the folder {folder}",
-            "Give the photo folder apart, if it is a link: pipeline run PHOTOS --cameras FILE." if linked else
-            f"A transforms file may name {what}s inside its own folder only.",
-        )  # fmt: skip
-    return file

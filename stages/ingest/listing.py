@@ -26,21 +26,7 @@ RAW_EXTENSIONS = (
     ".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".srf", ".raf", ".orf", ".rw2", ".pef", ".raw", ".iiq",
 )
 # fmt: on
-RAW_EXTENSIONS = (
-    ".dng",
-    ".cr2",
-    ".cr3",
-    ".nef",
-    ".nrw",
-    ".arw",
-    ".srf",
-    ".raf",
-    ".orf",
-    ".rw2",
-    ".pef",
-    ".raw",
-    ".iiq",
-)
+MASKS = "masks"  # the folder of masks, whatever its letters' case
 MAX_OTHER_FILES = 2  # files beside a video, too few to be a set of photos
 FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
 _LINKS_HINT = "Fetch them (git annex get, dvc pull), or connect the drive that they lie on."
@@ -108,7 +94,7 @@ def _is_lost(file: Path) -> bool:
 
 
 def _is_photo_folder(folder: Path) -> bool:
-    return not folder.name.startswith(".") and folder.name != "masks" and not (folder / "run.json").is_file()
+    return not folder.name.startswith(".") and folder.name.lower() != MASKS and not (folder / "run.json").is_file()
 
 
 def _may_be_photo(file: Path) -> bool:

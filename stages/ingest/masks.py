@@ -9,12 +9,14 @@ import numpy as np
 from PIL import Image
 
 from stages.ingest.auxiliary_files import marks_ignored
-from stages.ingest.decoding import DecodeError, decode, upright, upright_size
+from stages.ingest.decoding import Decoded, DecodeError, decode, upright, upright_size
 from stages.io.files import write_png
 from stages.io.photos import Photo
 from stages.io.pixels import pillow
 
 USE_FROM = 128  # of 255: from here on a pixel counts as used
+NEARLY_BLACK, NEARLY_WHITE = 16, 239  # of 255: what compression leaves of black and white
+MIN_GREY, MAX_LABELS = 0.25, 32  # of a picture's pixels; values
 STILL_BACKGROUND_HINT = (
     "If it was the thing that turned, before a still background, mask the background (masks/NAME.png, black is "
     "ignored) or use a plain backdrop."
@@ -25,13 +27,15 @@ STILL_BACKGROUND_HINT = (
 class Mask:
     """A mask as large as its photo: ``pixels`` (h, w) uint8, 255 use, 0 ignore; what was done to make it fit.
 
-    ``ambiguous``: its shape does not tell whether it is of the upright photo or of what its file stores.
+    ``ambiguous``: its shape does not tell whether it is of the upright photo or of what its file stores. ``grey``: it
+    is neither black nor white for the most part, as a picture would be.
     """
 
     pixels: np.ndarray
     turned: bool
     resized: bool
     ambiguous: bool
+    grey: bool
 
 
 def are_of_stored_pixels(pairs: Iterable[tuple[Path, Path]]) -> bool | None:
@@ -61,11 +65,7 @@ def read_mask(file: Path, width: int, height: int, orientation: int, stored: boo
         decoded = decode(file)
     except DecodeError as error:
         raise DecodeError(f"its mask {file.name} cannot be used: {error}") from error
-    light = decoded.pixels[..., :3].max(axis=2)
-    if decoded.pixels.shape[2] == 4:
-        light = np.rint(light * (decoded.pixels[..., 3] / 255.0)).astype(np.uint8)
-    if light.max() == 1:  # a mask of 0 and 1
-        light = 255 * light
+    light, grey = _light(decoded, file)
     if marks_ignored(file.name):  # all that is not black, as instant-ngp has it
         light = np.where(light > 0, np.uint8(0), np.uint8(255))
     pixels = np.where(light >= USE_FROM, np.uint8(255), np.uint8(0))
@@ -82,8 +82,38 @@ def read_mask(file: Path, width: int, height: int, orientation: int, stored: boo
     if resized:
         pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST)
     if not pixels.any():
-        raise DecodeError(f"its mask {file.name} ignores all of it (its brightest value is {light.max()} of 255)")
-    return Mask(pixels, turned, resized, ambiguous)
+        alpha = ", where it is not transparent" if decoded.pixels.shape[2] == 4 else ""
+        raise DecodeError(
+            f"its mask {file.name} ignores all of it (its brightest value is {light.max()} of 255{alpha})"
+        )
+    return Mask(pixels, turned, resized, ambiguous, grey)
+
+
+def _light(decoded: Decoded, file: Path) -> tuple[np.ndarray, bool]:
+    """How bright a mask's pixels are, (h, w) uint8, and whether it looks like a picture.
+
+    In a picture that is cut out the transparent parts are the mask. In labels, small numbers without losses, all but 0
+    is used, as COLMAP and nerfstudio have it.
+    """
+    light = decoded.pixels[..., :3].max(axis=2)
+    if decoded.pixels.shape[2] == 4:
+        alpha = decoded.pixels[..., 3]
+        if _is_picture(light[alpha >= USE_FROM]):
+            return alpha, False
+        return np.rint(light * (alpha / 255.0)).astype(np.uint8), False
+    if not light.any() and decoded.stored == "deep grey":  # 1 of 65535
+        with pillow().open(file) as image:
+            labels = Image.fromarray((np.asarray(image) > 0).astype(np.uint8))
+        light = np.asarray(upright(labels, decoded.camera_key.orientation))
+    if light.max() < USE_FROM and not decoded.lossy:
+        light = np.where(light > 0, np.uint8(255), np.uint8(0))
+    return light, _is_picture(light)
+
+
+def _is_picture(light: np.ndarray) -> bool:
+    """Whether many pixels are grey, in many shades: soft edges are few, labels are few values."""
+    grey = light[(light > NEARLY_BLACK) & (light < NEARLY_WHITE)]
+    return len(grey) > MIN_GREY * light.size and len(np.unique(grey)) > MAX_LABELS
 
 
 def _stored(size: tuple[int, int], orientation: int) -> tuple[int, int]:

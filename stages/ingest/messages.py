@@ -6,14 +6,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from stages.contract import Note, Progress, StageError, listed
-from stages.ingest.auxiliary_files import instant_ngp_masks, is_mask
+from stages.ingest.auxiliary_files import ALL_PHOTOS, instant_ngp_masks, is_mask
 from stages.ingest.masks import STILL_BACKGROUND_HINT
 from stages.ingest.near_duplicates import Brackets
 from stages.ingest.sharpness import BLURRED
-from stages.ingest.sources import Source, photos_beside, unused_cameras, unused_masks
+from stages.ingest.sources import Source, mask_beside, photos_beside, unused_cameras, unused_masks
 from stages.io.photos import Photo, Rejection
 
 MAX_NOTES = 10
+OF_MASK = "its mask "  # how rejections for a mask begin
+MANY_IGNORED = 0.6  # of the pixels: masks that are meant the other way round ignore so many
 NEARLY_BLACK = 16  # of 255: the most that 12 bits make in a file of 16
 HINT = "Take 20 to 100 overlapping photos of one scene from different places and put them into one folder."
 
@@ -58,9 +60,15 @@ def note_unused(source: Source, photos: Path, progress: Progress) -> None:
         lie, them = ("1 photo lies", "is") if beside == 1 else (f"{beside} photos lie", "are")
         how = f"to use all, move them into images/; to use only them, move images/ out of {folder}"
         progress.note("ingest.photos-beside-images", f"{lie} in {folder} beside images/ and {them} not used: {how}")
+    if others := source.other_endings:
+        which = listed([f"{shown(photo)} ({shown(path)})" for path, photo in others.items()], 3)
+        words = f"{len(others)} frames name files of another ending than the photos that are taken for them: {which}"
+        progress.note("ingest.other-endings", words)
     if (cameras := unused_cameras(source)) is not None:
         place, option = shown(str(cameras)), shown(f"--cameras {shlex.quote(str(cameras))}")
         progress.note("ingest.unused-cameras", f"cameras lie in {place} and are not used: {option} would use them")
+    if (mask := mask_beside(source, photos)) is not None:
+        progress.note(*_one_mask(str(mask)))
     if (masks := unused_masks(source)) is not None:
         lie, wanted = shown(str(masks)), shown(str(source.root / "masks"))
         progress.note(
@@ -82,7 +90,9 @@ def excluded(files: Mapping[str, str]) -> list[Note]:
     count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
     words = f"{count} excluded, named as a mask, depth map or other copy of a photo: {listed(named, 3)}"
     notes.append(Note("ingest.excluded", words))
-    if mask := next((name for name in sorted(files) if is_mask(name)), None):
+    if mask := next((name for name, photo in sorted(files.items()) if photo == ALL_PHOTOS), None):
+        notes.append(_one_mask(mask))
+    elif mask := next((name for name in sorted(files) if is_mask(name)), None):
         place = f"masks/{os.path.splitext(files[mask])[0]}.png"
         notes.append(
             Note(
@@ -91,6 +101,11 @@ def excluded(files: Mapping[str, str]) -> list[Note]:
             )
         )
     return notes
+
+
+def _one_mask(name: str) -> Note:
+    words = f"{shown(name)} is not used: as a mask of all photos it would have to be copied to masks/NAME.png for each"
+    return Note("ingest.one-mask", words)
 
 
 def excluded_by_values(files: Sequence[str]) -> list[Note]:
@@ -146,10 +161,30 @@ def note_masks(ignored: Sequence[float], turned: int, resized: int, photos: int,
     turned_words = f", {turned} turned upright like the photo" if turned else ""
     resized_words = f", {resized} made as large as the photo" if resized else ""
     share = sum(ignored) / len(ignored)
+    polarity = "; black is ignored: invert masks that mark with white what to ignore" if share > MANY_IGNORED else ""
     progress.note(
         "ingest.masks",
-        f"masks of {len(ignored)} of {photos} photos ignore {share:.0%} of them{turned_words}{resized_words}",
+        f"masks of {len(ignored)} of {photos} photos ignore {share:.0%} of them{turned_words}{resized_words}{polarity}",
     )
+
+
+def stray_masks(files: Sequence[str]) -> list[Note]:
+    """A note on files in folders of masks that are no photo's."""
+    if not files:
+        return []
+    named = listed([shown(name) for name in files], 3)
+    are = "is" if len(files) == 1 else "are"
+    words = f"{named} {are} no photo's mask: masks are called after their photos, masks/NAME.png"
+    return [Note("ingest.stray-masks", words)]
+
+
+def grey_masks(names: Sequence[str]) -> list[Note]:
+    """A note on photos whose masks are in shades of grey."""
+    if not names:
+        return []
+    words = f"masks of {len(names)} photos are neither black nor white for the most part, as photos are"
+    words = f"{words}: what is brighter than half is used. Look at masks/ of {listed([shown(n) for n in names], 3)}"
+    return [Note("ingest.grey-masks", words)]
 
 
 def taken_as_upright(names: Sequence[str]) -> list[Note]:
@@ -173,11 +208,14 @@ def too_few(source: Source, names: Sequence[str], rejected: Sequence[Rejection])
     """The error for one photo or none, ``names``, and what the rejections show."""
     if not names:
         first = f"{shown(rejected[0].name)}: {rejected[0].reason}"
+        of_masks = all(one.reason.startswith(OF_MASK) for one in rejected)
         return StageError(
             "ingest.no-usable-photo",
             f"none of the {len(rejected)} files in {source.root} is a usable photo",
             first,
-            HINT,
+            "Correct the masks (black is ignored, white is used), or move them away to go without."
+            if of_masks
+            else HINT,
         )
     only = shown(names[0])
     if rejected and all(rejection.reason.startswith("identical to ") for rejection in rejected):

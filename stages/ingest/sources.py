@@ -5,22 +5,50 @@ Cheap: lists folders and reads at most the JSON of a transforms file, never an i
 
 import os
 import re
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from stages.contract import StageError, listed
-from stages.ingest.auxiliary_files import IGNORED, auxiliary_files, instant_ngp_masks, pair_masks
+from stages.ingest.auxiliary_files import IGNORED, ONE_FOR_ALL, auxiliary_files, instant_ngp_masks, is_mask, pair_masks
 from stages.ingest.frame_files import FrameFiles
-from stages.ingest.listing import FOLDER_HINT, IMAGES, files_below, is_video, list_photos, photo_root, walk_photos
+from stages.ingest.listing import (
+    FOLDER_HINT,
+    IMAGES,
+    MASKS,
+    files_below,
+    is_video,
+    list_photos,
+    photo_root,
+    walk_photos,
+)
 from stages.io.transforms_files import HELD_OUT, TRAIN, photo_names, read_splits
 
 SourceKind = Literal["photos", "video", "transforms", "blender", "colmap", "llff"]
 
 FEW_NAMES = 2
+MAX_DEPTH = 4  # folders below one that is given, in which COLMAP models are looked for: colmap/sparse/0, dense/0/sparse
 LLFF, LLFF_FILE = ".npy", "poses_bounds.npy"  # the ending of LLFF's file of cameras, and what it is called
+_CONVERTER = "Export a COLMAP model, or make a transforms.json of it: ns-process-data {} --help (nerfstudio)"
+# Files of cameras that are not read, by their endings: what they are, and what to do.
+OTHER_CAMERAS = {
+    ".xml": ("an XML file, as Metashape writes it", _CONVERTER.format("metashape")),
+    ".csv": ("a table, as RealityScan writes it", _CONVERTER.format("realitycapture")),
+    ".xmp": ("one photo's XMP file, as RealityScan writes it", _CONVERTER.format("realitycapture")),
+    ".db": (
+        "COLMAP's database, which holds features and matches, and no poses",
+        "Give the folder of the model that was made of it (sparse/0), or leave --cameras out.",
+    ),
+    ".out": ("a Bundler file", ""),
+    ".nvm": ("a VisualSFM file", ""),
+    ".sfm": ("a Meshroom file", ""),
+    ".abc": ("an Alembic file", ""),
+    ".npz": ("a NumPy archive", ""),
+}
+_OF_MASKS = re.compile(r"masks?([._-].*)?", re.IGNORECASE)
 _HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
 
 
@@ -36,7 +64,7 @@ class Source:
     the files that a transforms file names as masks, each after its photo's name and .png, and then all files in folders
     named masks, each after the name, relative to ``root``, that it would have without such a folder in it. ``excluded``
     are files in a folder of photos that belong to one of them by their names, as a depth map does, and that photo, by
-    name.
+    name. ``other_endings`` are those of ``frames`` whose photo has another ending than its file_path.
     """
 
     kind: SourceKind
@@ -46,6 +74,7 @@ class Source:
     frames: Mapping[str, str] = field(default_factory=dict)
     masks: tuple[tuple[str, Path], ...] = ()
     excluded: Mapping[str, str] = field(default_factory=dict)
+    other_endings: Mapping[str, str] = field(default_factory=dict)
 
     def name(self, file: Path) -> str:
         """The name of one of ``files``: relative to ``root``, with forward slashes, always encodable as UTF-8."""
@@ -81,7 +110,7 @@ def _source(photos: Path, cameras: Path | None) -> Source:
     if photos.is_file() and is_video(photos):
         return Source("video", photos.parent, None, (photos,))
     if photos.is_file():
-        return _from_transforms("transforms", photos.parent, photos)
+        return _from_transforms("transforms", photos.parent, photos, alone=True)
     root = photo_root(photos)
     cameras = cameras and _llff_in(cameras)
     if cameras is not None and cameras.is_file() and cameras.suffix.lower() != LLFF:
@@ -111,9 +140,9 @@ def unused_cameras(source: Source) -> Path | None:
     if source.kind != "photos":
         return None
     places = (source.root.parent, source.root) if source.root.name == "images" else (source.root,)
-    for place in places:
+    for place, name in product(places, ("sparse", "colmap", "dense")):
         with suppress(StageError, OSError):
-            return _colmap_model(place / "sparse", [source.name(file) for file in source.files])
+            return _colmap_model(place / name, [source.name(file) for file in source.files])
     for file in (place / "transforms.json" for place in places):
         with suppress(StageError, OSError):
             if set(_from_transforms("transforms", source.root, file).files) & set(source.files):
@@ -127,9 +156,9 @@ def unused_masks(source: Source) -> Path | None:
     if source.masks:
         return None
     names = [source.name(file) for file in source.files]
-    folders = [source.root.parent / name for name in ("masks", "mask")]
-    folders += [source.cameras.parent / "masks"] if source.cameras else []
-    for folder in filter(Path.is_dir, folders):
+    folders = [source.root.parent, *([source.cameras.parent] if source.cameras else [])]
+    named = [child for folder in folders for child in sorted(folder.iterdir()) if _OF_MASKS.fullmatch(child.name)]
+    for folder in filter(Path.is_dir, named):
         inside = files_below(folder, lambda _: True)
         if pair_masks(names, [(_name(folder, file), file) for file in inside])[0]:
             return folder
@@ -141,7 +170,15 @@ def photos_beside(source: Source, photos: Path) -> int:
     if source.kind not in ("photos", "colmap") or source.root != photos.absolute() / "images":
         return 0
     named = (file for file in photos.glob("*") if file.suffix.lower() in IMAGES and not file.name.startswith("."))
-    return sum(file.is_file() for file in named)
+    return sum(file.is_file() and not is_mask(file.name) for file in named)
+
+
+def mask_beside(source: Source, photos: Path) -> Path | None:
+    """A single mask in the folder PHOTOS itself where the photos of its ``images`` folder are taken."""
+    if source.root != photos.absolute() / "images":
+        return None
+    named = (file for file in sorted(photos.iterdir()) if file.suffix.lower() in IMAGES)
+    return next((file for file in named if file.stem.lower() in ONE_FOR_ALL), None)
 
 
 def is_gone(photos: Path) -> bool:
@@ -157,16 +194,22 @@ def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], 
     """What lies in a ``masks`` folder in ``root`` or in any folder of photos below it, or beside one of these that is
     called as folders of nothing but photos are. See :class:`Source`."""
     holders = sorted({holder for file in files for holder in file.parents if holder.is_relative_to(root)} | {root})
-    places = [(holder / "masks", holder.relative_to(root)) for holder in holders]
-    places += [
-        (holder.parent / "masks", holder.relative_to(root)) for holder in holders if _HAS_BESIDE.fullmatch(holder.name)
-    ]
+    places = [(masks, holder.relative_to(root)) for holder in holders for masks in _named_masks(holder)]
+    for holder in holders:
+        if named := _HAS_BESIDE.fullmatch(holder.name):
+            of_reduced = _named_masks(holder.parent, named[1] or "")
+            places += [(masks, holder.relative_to(root)) for masks in of_reduced or _named_masks(holder.parent)]
     found = []
     for masks, stands_in in places:
-        if masks.is_dir():
-            inside = files_below(masks, lambda folder: not folder.name.startswith("."))
-            found += [(_name(masks, file, stands_in), file) for file in inside]
+        inside = files_below(masks, lambda folder: not folder.name.startswith("."))
+        found += [(_name(masks, file, stands_in), file) for file in inside]
     return tuple(found)
+
+
+def _named_masks(holder: Path, reduced: str = "") -> list[Path]:
+    """The folders of masks in a folder: Masks is one, too; of ``images_4`` those are in ``masks_4``."""
+    with os.scandir(holder) if holder.is_dir() else nullcontext(()) as entries:
+        return sorted(Path(one) for one in entries if one.name.lower() == MASKS + reduced and one.is_dir())
 
 
 def _beside(source: Source) -> tuple[tuple[str, Path], ...]:
@@ -219,19 +262,27 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
             f"{photos.name} and --cameras {cameras}",
             "Give the photo folder with --cameras.",
         )
-    if cameras is not None and cameras.is_file() and (suffix := cameras.suffix.lower()) not in (".json", LLFF):
-        of_colmap = suffix in (".bin", ".txt")
-        raise StageError("ingest.unknown-cameras", 
-            f"cannot use the cameras {cameras.name}",
-            "it is no transforms file, whose name ends in .json, and no poses_bounds.npy",
-            f"Give the folder of the COLMAP model: --cameras {cameras.parent}" if of_colmap else
-            "Give a transforms file or the folder of a COLMAP model: cameras in other forms are not read.",
-        )  # fmt: skip
+    if cameras is not None and cameras.is_file() and cameras.suffix.lower() not in (".json", LLFF):
+        raise _unknown_cameras(cameras)
 
 
-def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
+def _unknown_cameras(cameras: Path) -> StageError:
+    suffix = cameras.suffix.lower()
+    what, hint = OTHER_CAMERAS.get(suffix, ("of another kind", ""))
+    if suffix in (".bin", ".txt"):
+        what, hint = "one file of a COLMAP model", f"Give its folder: --cameras {cameras.parent}"
+    return StageError(
+        "ingest.unknown-cameras",
+        f"cannot use the cameras {cameras.name}",
+        f"it is {what}; a transforms file (.json), the folder of a COLMAP model and poses_bounds.npy are read",
+        hint or "Export one of these, or leave --cameras out, and the cameras are found from the photos.",
+    )
+
+
+def _from_transforms(kind: SourceKind, root: Path, cameras: Path, alone: bool = False) -> Source:
+    """``alone``: the file was given as PHOTOS, and so its folder is a stranger's."""
     place = cameras.parent if cameras.is_file() else cameras
-    find = FrameFiles((root,) if place == root else (root, root.parent, place))
+    find = FrameFiles((root,) if place == root else (root, root.parent, place), follows_links=not alone)
     frames, files = _frames(cameras, find)
     if not any(map(Path.is_file, files.values())):
         find = replace(find, of_other_folders=True)
@@ -244,7 +295,8 @@ def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
     foreign = [frame for frame in frames if len(photo_names(frame)) == 1]
     named = {photos[frame["file_path"]]: mask for frame in foreign if (mask := frame.get("mask_path"))}
     masks = tuple((f"{photo}.png", find.mask(mask)) for photo, mask in named.items())
-    return Source(kind, root, cameras, in_order, photos, masks)
+    other_endings = {path: _name(root, file) for path, file in find.other_endings.items()}
+    return Source(kind, root, cameras, in_order, photos, masks, other_endings=other_endings)
 
 
 def _frames(cameras: Path, find: FrameFiles) -> tuple[list[dict[str, Any]], dict[str, Path]]:
@@ -316,10 +368,18 @@ def _llff_in(cameras: Path) -> Path:
 
 
 def _colmap_models(folder: Path) -> list[Path]:
-    """All COLMAP models in ``folder``: itself, and below it and its ``sparse`` folder."""
+    """All COLMAP models in ``folder``: itself, and below it and its ``sparse`` folder; where there is none, deeper."""
     places = [folder, folder / "sparse"]
     places += [child for place in places if place.is_dir() for child in sorted(place.iterdir())]
-    return sorted({place for place in places if _model_files(place)})
+    found = sorted({place for place in places if _model_files(place)})
+    return found or sorted(place for place in _below(folder, MAX_DEPTH) if _model_files(place))
+
+
+def _below(folder: Path, depth: int) -> Iterator[Path]:
+    for child in folder.iterdir() if depth and folder.is_dir() else ():
+        if child.is_dir() and not child.name.startswith(".") and not (child / "run.json").is_file():
+            yield child
+            yield from _below(child, depth - 1)
 
 
 def _colmap_model(folder: Path, photos: Sequence[str]) -> Path:
@@ -330,8 +390,9 @@ def _colmap_model(folder: Path, photos: Sequence[str]) -> Path:
         raise StageError(
             "ingest.no-colmap-model",
             f"no COLMAP model in {folder}",
-            "there is no cameras and images with .bin or .txt, nor a transforms.json",
-            "Give the model's own folder, for example sparse/0, or a transforms file.",
+            _what_is_missing(folder),
+            "Give the folder of a COLMAP model (sparse/0), a transforms.json or a poses_bounds.npy; or leave --cameras "
+            "out, and the cameras are found from the photos.",
         )
     if len(models) > 1:
         counts = {model: _cameras_of(model, photos) for model in models}
@@ -344,6 +405,17 @@ def _colmap_model(folder: Path, photos: Sequence[str]) -> Path:
             f"Give the one with most: --cameras {best}",
         )
     return models[0]
+
+
+def _what_is_missing(folder: Path) -> str:
+    parts = [path.name for part in ("cameras", "images") for path in folder.glob(f"{part}.*")]
+    here = [path for path in folder.iterdir() if path.is_file()] if folder.is_dir() else []
+    if parts:
+        return f"it needs cameras and images, both in .bin or in .txt, and there is only {listed(parts, FEW_NAMES)}"
+    if database := next((path.name for path in here if path.suffix.lower() == ".db"), None):
+        return f"{database} holds COLMAP's features and matches, and no poses"
+    there = f"; there is {listed(sorted(path.name for path in here), FEW_NAMES)}" if here else ""
+    return f"there is no cameras and images with .bin or .txt, nor a transforms.json{there}"
 
 
 def _cameras_of(model: Path, photos: Sequence[str]) -> int:

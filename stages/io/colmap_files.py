@@ -5,6 +5,7 @@ without end, or abort the process. https://colmap.github.io/format.html. Only ca
 what rigs and frames say of poses is in images, too, and tracks are what images say of their points.
 """
 
+import codecs
 import math
 import struct
 from collections.abc import Callable, Iterator, Sequence
@@ -41,6 +42,7 @@ PARAMETERS = dict(CAMERA_MODELS.values())
 MAX_SIDE = 2**31 - 1
 MAX_COORDINATE = 1e30  # of anything, in its units: squares and products of three such numbers are numbers, too
 NO_POINT = -1
+UNKNOWN_ERROR = "0"  # of a point in text that ends with its colour
 
 Entry = TypeVar("Entry")
 
@@ -82,7 +84,7 @@ def read_model_files(folder: Path) -> ModelFiles:
         else {"cameras": _text_cameras, "images": _text_images, "points3D": _text_points}
     )
     files = {part: folder / f"{part}{'.bin' if binary else '.txt'}" for part in readers}
-    if without_points := not files["points3D"].is_file():
+    if not files["points3D"].is_file():
         readers["points3D"] = lambda _: iter(())
     parts = []
     for part, path in files.items():
@@ -91,7 +93,7 @@ def read_model_files(folder: Path) -> ModelFiles:
         except (struct.error, ValueError, OverflowError) as error:
             raise ValueError(f"{path.name} is damaged: {error}") from error
     model = ModelFiles(*parts)
-    if without_points:  # what images see are then points that nobody knows
+    if not model.points:  # what images see are then points that nobody knows
         images = {i: image._replace(points=np.full_like(image.points, NO_POINT)) for i, image in model.images.items()}
         model = model._replace(images=images)
     _check(model)
@@ -145,6 +147,7 @@ def _check(model: ModelFiles) -> None:
 
 
 def _camera(name: str, width: int, height: int, params: tuple[float, ...]) -> Camera:
+    name = name.upper()
     if name not in PARAMETERS:
         raise ValueError(f"there is no camera model {name[:40]!r}")
     if len(params) != PARAMETERS[name]:
@@ -233,7 +236,9 @@ class _Line(NamedTuple):
 
 
 def _lines(path: Path) -> list[_Line]:
-    text = path.read_text("utf-8-sig", "backslashreplace")
+    data = path.read_bytes()
+    is_utf16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # as PowerShell redirects text
+    text = data.decode("utf-16" if is_utf16 else "utf-8-sig", "backslashreplace")
     return [_Line(i, line) for i, line in enumerate(text.split("\n"), 1) if not line.lstrip().startswith("#")]
 
 
@@ -242,18 +247,30 @@ def _filled(path: Path) -> list[_Line]:
 
 
 def _numbers(line: _Line, fields: Sequence[str], kind: Callable[[str], Any]) -> list[Any]:
-    try:
-        return [kind(field) for field in fields]
-    except ValueError as error:
-        raise line.damaged(str(error)) from error
+    numbers = []
+    for field in fields:
+        try:
+            numbers.append(kind(field))
+        except ValueError as error:
+            raise line.damaged(f"{field[:20]!r} is no {'whole ' * (kind is _whole)}number") from error
+    return numbers
+
+
+def _whole(field: str) -> int:
+    """A whole number, which may be written as 1.0."""
+    number = float(field)
+    if not number.is_integer():
+        raise ValueError
+    return int(number) if "." in field or "e" in field.lower() else int(field)
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
     for line in _filled(path):
         number, model, width, height, *params = line.fields(4, "a camera")
-        number, *size = _numbers(line, (number, width, height), int)
+        number, *size = _numbers(line, (number, width, height), _whole)
+        numbers = tuple(_numbers(line, params, float))
         try:
-            yield number, _camera(model, size[0], size[1], tuple(map(float, params)))
+            yield number, _camera(model, size[0], size[1], numbers)
         except ValueError as error:
             raise line.damaged(str(error)) from error
 
@@ -268,8 +285,10 @@ def _text_images(path: Path) -> Iterator[tuple[int, FileImage]]:
         place += 1
         if not line.text.strip():
             continue
-        fields = line.fields(10, "an image (its line of keypoints, below it, may be empty)")
-        number, camera = _numbers(line, (fields[0], fields[8]), int)
+        fields = line.fields(
+            10, "an image (id, quaternion, translation, camera, name; below it a line of keypoints or none)"
+        )
+        number, camera = _numbers(line, (fields[0], fields[8]), _whole)
         pose = np.array(_numbers(line, fields[1:8], float))
         follows = lines[place] if place < len(lines) else _Line(place, "")
         is_left_out = _is_image(follows)
@@ -278,7 +297,7 @@ def _text_images(path: Path) -> Iterator[tuple[int, FileImage]]:
         if len(seen) % 3:
             raise follows.damaged("keypoints are triples, x, y and the id of a point or -1")
         xy = np.array(_numbers(follows, [v for i, v in enumerate(seen) if i % 3 < 2], float)).reshape(-1, 2)
-        points = np.array(_numbers(follows, seen[2::3], int), np.int64)
+        points = np.array(_numbers(follows, seen[2::3], _whole), np.int64)
         yield number, FileImage(line.text.split(maxsplit=9)[9].strip(), camera, pose, xy, points)
 
 
@@ -296,8 +315,11 @@ def _are_numbers(fields: Sequence[str]) -> bool:
 
 def _text_points(path: Path) -> Iterator[tuple[int, FilePoint]]:
     for line in _filled(path):
-        number, *xyz_rgb, error = line.fields(8, "a point")[:8]
-        (number,), (x, y, z, *rgb, error_px) = _numbers(line, (number,), int), _numbers(line, (*xyz_rgb, error), float)
+        number, *xyz_rgb, error = [*line.fields(7, "a point"), UNKNOWN_ERROR][:8]
+        (number,), (x, y, z, *rgb, error_px) = (
+            _numbers(line, (number,), _whole),
+            _numbers(line, (*xyz_rgb, error), float),
+        )
         if not all(0 <= value <= 255 for value in rgb):
             raise line.damaged("a colour is not between 0 and 255")
         yield number, FilePoint((x, y, z), tuple(map(round, rgb)), error_px)

@@ -34,7 +34,8 @@ def read_transforms(transforms: Path, *, may_be_empty: bool = False) -> dict[str
             "io.transforms-not-json", f"cannot read {transforms.name}", f"it is not JSON ({error})", _HINT
         ) from error
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
-        raise StageError("io.transforms-without-frames", what, "it has no list named 'frames'", _HINT)
+        has = f": it has {_keys(content)}" if isinstance(content, dict) else ""
+        raise StageError("io.transforms-without-frames", what, f"it has no list named 'frames'{has}", _HINT)
     if not (content["frames"] or may_be_empty):
         raise StageError("io.transforms-empty", what, "its list 'frames' is empty", _HINT)
     _check_frames(content["frames"], what)
@@ -61,8 +62,11 @@ def _why_incomplete(index: int, frame: Any) -> str:
     if "file_path" in frame and not isinstance(frame["file_path"], str):
         return f"the file_path of frame {index} is {ascii(frame['file_path'])[:MAX_LETTERS]}, and no name of a file"
     lacks = " and no ".join(key for key in ("file_path", "transform_matrix") if key not in frame)
-    has = listed([ascii(key)[1:-1][:MAX_LETTERS] for key in frame], MAX_KEYS) or "nothing"
-    return f"frame {index} has no {lacks}: it has {has}"
+    return f"frame {index} has no {lacks}: it has {_keys(frame)}"
+
+
+def _keys(content: Mapping[str, Any]) -> str:
+    return listed([ascii(key)[1:-1][:MAX_LETTERS] for key in content], MAX_KEYS) or "nothing"
 
 
 def read_splits(

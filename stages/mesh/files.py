@@ -44,7 +44,7 @@ class ColouredMesh(NamedTuple):
 
 def ply_bytes(mesh: ColouredMesh) -> bytes:
     """Binary little-endian PLY with normals and colours; double coordinates where float32 would be too coarse."""
-    real, name = ("<f8", "double") if _offset(mesh.vertices).any() else ("<f4", "float")
+    real, name = ("<f8", "double") if offset_for_float32(mesh.vertices).any() else ("<f4", "float")
     vertex = np.empty(len(mesh.vertices), [("p", real, 3), ("n", "<f4", 3), ("c", "u1", 3)])
     vertex["p"], vertex["n"], vertex["c"] = mesh.vertices, mesh.normals, mesh.colours
     face = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", 3)])
@@ -74,7 +74,7 @@ def obj_bytes(mesh: ColouredMesh) -> bytes:
 
 def glb_bytes(mesh: ColouredMesh, upright_from_mesh: np.ndarray) -> bytes:
     """Binary glTF 2.0; ``upright_from_mesh`` (3, 3) is the rotation to +y up."""
-    offset = _offset(mesh.vertices)
+    offset = offset_for_float32(mesh.vertices)
     centred = trimesh.Trimesh(
         mesh.vertices - offset,
         mesh.faces,
@@ -118,7 +118,7 @@ def _size(vertices: np.ndarray) -> float:
     return float(np.linalg.norm(np.ptp(vertices, axis=0)))
 
 
-def _offset(vertices: np.ndarray) -> np.ndarray:
+def offset_for_float32(vertices: np.ndarray) -> np.ndarray:
     """What must be subtracted from the vertices for float32 to hold them; zero for all but far-away meshes."""
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     far = np.abs(centre).max() > FAR_FROM_ORIGIN * _size(vertices)

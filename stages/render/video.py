@@ -203,7 +203,7 @@ def with_appearance(
     description = new_view_words(field)
     if photo is None:
         return renderer, description
-    if renderer.model is renderer.field:
+    if "exposure" not in field["effects"]:
         progress.note(
             "render.no-exposure",
             f"the field has no exposure model: all photos, including {photo}, get the same exposure",

@@ -11,7 +11,6 @@ ADVICE = {
     "rolling_shutter": "Take photos standing still in place of a video, or move the camera slowly.",
     "participating_media": "Wait for clear air: haze, smoke and water are taken for parts of the scene.",
     "transients": "Mask out what moves, or leave out the photos that show it.",
-    "vignetting": "Close the aperture, or correct the vignetting before ingest.",
     "scale_variation": "Keep a similar distance, or add photos at the distances in between.",
 }
 

@@ -31,7 +31,7 @@ from stages.report.cameras import (
     uncertainty,
 )
 from stages.report.effects import effects_table
-from stages.report.plots import ORDER_COLOURS, Score, camera_svgs, curve_svg
+from stages.report.plots import ORDER_COLOURS, Score, camera_svgs, curve_svg, falloff_svg
 from stages.report.profile import profile_bar
 from stages.tradeoff.plots import COLUMNS, plot_svg, rendering_sentence, table_cells
 from stages.train.curve import diminishing_returns_message, doubling_message, more_option, predicted_gain, ssim_message
@@ -145,6 +145,7 @@ def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
         rejected=results.photos["rejected"] if results.photos else [],
         **_cameras_part(results, names),
         effects=effects_table(results.effects),
+        falloff=_falloff(results),
         curve=_curve(results),
         profile=profile_bar(results.profile),
         metrics=results.metrics,
@@ -155,6 +156,12 @@ def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
         study=_study(results),
         **_run_part(results, summary, config),
     )
+
+
+def _falloff(results: Results) -> Markup | None:
+    """The curves of effect vignetting; None without it."""
+    learnt = (results.field or {}).get("effects", {}).get("vignetting")
+    return Markup(falloff_svg(list(learnt.values()))) if learnt else None
 
 
 def _cameras_part(results: Results, names: Mapping[str, str]) -> dict[str, Any]:

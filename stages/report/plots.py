@@ -13,6 +13,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.patches import Rectangle
 
 from nerf import REGION_HALF_SIZE
+from nerf.effects.statistics.exposure import EV
+from nerf.effects.statistics.vignetting import log_falloff
 from nerf.geometry.scene import Scene, View
 from nerf.training.learning_curve import PredictedGain, diminishing_returns_seconds, quality_at
 from stages.io.amounts import duration
@@ -96,6 +98,19 @@ def _draw_baselines(axes: Axes, baselines: dict[str, float]) -> None:
         axes.text(1.01, psnr, f"{name}\n{psnr:.1f} dB", linespacing=1.1, **place)
     low, high = axes.get_ylim()
     axes.set_ylim(low - ROOM_BELOW * (high - low), high)
+
+
+def falloff_svg(rows: Sequence[Sequence[float]]) -> str:
+    """By how much light falls from the optical axis to the corner (EV), a line for each camera. ``rows``: those of
+    effect vignetting in field.json."""
+    distance = np.linspace(0, 1, 51)
+    with svg_figure((5, 2.4), "falloff") as figure:
+        axes = figure.add_subplot()
+        for row in np.unique(np.array(rows), axis=0):
+            axes.plot(distance, -log_falloff(distance**2, row[1:]) / EV, color=BLUE, lw=2)
+        axes.set(xlabel="distance from the optical axis (1: the corner)", ylabel="gain (EV)", xlim=(0, 1))
+        axes.grid(color=INK, alpha=0.15, lw=0.8)
+        return svg_element(figure)
 
 
 def camera_svgs(scene: Scene, views: Sequence[View], xyz: np.ndarray, rgb: np.ndarray, joined: bool) -> dict[str, str]:

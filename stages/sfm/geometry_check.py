@@ -195,7 +195,7 @@ def check_poses(
             break
         misplaced &= ~cleared
     agrees, contradicts = error <= tolerance, _contradicts(matches, error, tolerance)
-    linked = _matrix(matches, error <= CONTRADICTION_FACTOR * tolerance, count)
+    linked = _matrix(matches, agrees, count)
     unlinked = ~misplaced & (connected(np.where(misplaced[:, None] | misplaced[None], 0, linked) > 0) > 0)
     passed = ~(misplaced | unlinked)
     counted = passed[matches.pairs].all(axis=1) & (agrees | (matches.weight >= MIN_PAIR_MATCHES))

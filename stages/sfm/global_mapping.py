@@ -62,8 +62,9 @@ def main() -> None:
     folder = Path(job["folder"])
     scratch = folder.with_name(f"{folder.name}.scratch")
     thinned = Path(job["thinned"])
-    thin_matches(Path(job["database"]), thinned, TRACKS_PER_PHOTO)
-    models = map_globally(thinned, Path(job["images"]), scratch, job["seed"], job["camera_is_known"])
+    known = job["camera_is_known"]
+    thin_matches(Path(job["database"]), thinned, TRACKS_PER_PHOTO, camera_is_known=known)
+    models = map_globally(thinned, Path(job["images"]), scratch, job["seed"], known)
     shutil.rmtree(scratch, ignore_errors=True)
     if models:
         unfinished = folder.with_name(f"{folder.name}.unfinished")

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from stages.contract import Note
 from stages.sfm import global_mapping
 from stages.sfm.colmap.diagnosis import compare_models, disagree
+from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.mapping import incremental_options, map_globally, map_incrementally
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import (
@@ -50,10 +51,11 @@ def run_mapping(
     seed, camera_is_known = state.job.seed, state.job.camera_params is not None
     models, matches = Path(state.job.folder, "models"), database
     beside = _start_global_mapping(strategy, database, state)
+    mapping, hold_focal = strategy.mapping or MappingOptions(), False
     if state.thinned:
         matches = state.sibling("thinned")
-        thin_matches(database, matches)
-    options = incremental_options(seed, strategy.mapping or MappingOptions(), camera_is_known, state.thinned)
+        hold_focal = thin_matches(database, matches, camera_is_known=camera_is_known) and mapping.hold_focal
+    options = incremental_options(seed, mapping, camera_is_known, state.thinned, hold_focal)
     if strategy.mapping is None:
         found = map_globally(matches, state.images, models, seed, camera_is_known)
     else:
@@ -61,6 +63,8 @@ def run_mapping(
         found = map_incrementally(
             matches, state.images, models, options, lambda: state.send(phase="mapping", done=next(registered))
         )
+        if found and hold_focal:
+            release_focal_lengths(found[0])
     shutil.rmtree(models)
     checked = CheckedModel(None, {}, False, False)
     failure = global_mapping.failure(beside) if beside else None

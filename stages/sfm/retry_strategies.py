@@ -36,13 +36,14 @@ class MappingOptions(NamedTuple):
     init_min_tri_angle_deg: float = 16.0
     init_max_forward_motion: float = 0.95
     seed_offset: int = 0  # added to the run's seed
+    hold_focal: bool = True  # where all pairs together tell the focal lengths, hold these until all images are mapped
     structure_less_fallback: bool = False  # register images by other images where points are too few: slow on outliers
 
 
 MIN_POSE_INLIERS = 30  # COLMAP's default of abs_pose_min_num_inliers: with fewer a pose is not sure
 # A quarter of the angle and half of the inliers: what an initial pair of little baseline still has.
 WEAK_INITIAL_PAIR = MappingOptions(50, 4.0, 1.0)
-OTHER_SEED = MappingOptions(seed_offset=1)
+OTHER_SEED = MappingOptions(seed_offset=1, hold_focal=False)
 
 
 class Strategy(NamedTuple):
@@ -63,7 +64,7 @@ STRATEGIES = (
     Strategy("fisheye", "verifying and mapping again with a fisheye camera model", "fisheye", MappingOptions()),
     Strategy("relaxed ratio test", "matching them again with a relaxed ratio test", "relaxed", MappingOptions()),
     Strategy("weaker initial pair", "mapping again from a weaker initial pair", "same", WEAK_INITIAL_PAIR),
-    Strategy("other seed", "mapping again with another seed", "same", OTHER_SEED),
+    Strategy("other seed", "mapping again with another seed and free focal lengths", "same", OTHER_SEED),
     Strategy("global mapping", "mapping again with global mapping", "same", None),
     Strategy(
         "more features", "extracting twice as many features at twice the size", "more features", WEAK_INITIAL_PAIR

@@ -102,7 +102,7 @@ def rays_per_second(config: Config, scene: "Scene", decisions: Decisions) -> flo
 def seconds_per_step(config: Config, scene: "Scene", decisions: Decisions, device: str) -> float:
     """Measured: steps of a fresh field of known sizes, with its effects, on a grey picture, for about a second."""
     dataset = _grey_dataset(scene).to(device)
-    effects = image_effects(decisions, scene.of_split("train")[:1], dataset)
+    effects = image_effects(decisions, scene, scene.of_split("train")[:1], dataset)
     trainer = make_trainer(config, scene, dataset, seed=0, effects=effects)
     with use_matmul_precision(config.matmul):
         trainer.step(0, 0.0, 1.0)  # the first step pays for memory and kernels

@@ -98,7 +98,7 @@ def prepare(config: Config, scene: Scene, inputs: Inputs, folder: Path, progress
     decisions, views = read_decisions(inputs["effects"]), scene.of_split("train")
     return TrainingRun(
         lambda attempt: make_trainer(
-            config, scene, dataset, config.seed + attempt, image_effects(decisions, views, dataset)
+            config, scene, dataset, config.seed + attempt, image_effects(decisions, scene, views, dataset)
         ),
         evaluation_sets,
         budget,

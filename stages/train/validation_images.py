@@ -74,7 +74,7 @@ def held_out_evaluation(
     return HeldOutEvaluation(
         sample_evaluation_pixels(dataset, EVALUATION_PIXELS, background, EVALUATION_SEED).to(device),
         sample_evaluation_patches(dataset, EVALUATION_PATCHES, PATCH_SIZE, background, EVALUATION_SEED).to(device),
-        held_out_images(scene.of_split("train"), scene.of_split(split), device),
+        held_out_images(scene, scene.of_split("train"), scene.of_split(split), device),
     )
 
 

@@ -1,6 +1,7 @@
 """Whether photos are darker towards their corners: what gains leave, against the square of the radius."""
 
 import numpy as np
+from jaxtyping import Float
 
 from nerf.effects.statistics.exposure import EV, ExposureFit
 from nerf.effects.statistics.statistic import MIN_EFFECT, VALUE_PER_LOG_LIGHT, Statistic, classify, unknown
@@ -13,15 +14,29 @@ from nerf.effects.statistics.tracks import TrackColours, log_light
 THRESHOLD_EV = 2 * MIN_EFFECT / (0.24 * VALUE_PER_LOG_LIGHT) / EV
 
 
-def vignetting_statistic(tracks: TrackColours, fit: ExposureFit) -> Statistic:
-    """The gain at the corners beside the middle, EV, mean of the channels: the slope of ln(light) over the square of
-    the radius within photos and points alike, so neither gains nor points that are always in corners pass for it."""
+def vignetting_slope(tracks: TrackColours, fit: ExposureFit) -> tuple[float, float]:
+    """The slope of ln(light) over the square of the radius, mean of the channels, and its standard error; within photos
+    and points alike, so neither gains nor points that are always in corners pass for it. (0, inf): nothing is known."""
     if not fit.known.any():
-        return unknown("EV", THRESHOLD_EV, fit.unknown_because, False)
+        return 0.0, float("inf")
     y, square = log_light(tracks.colour[fit.used]), tracks.radius[fit.used] ** 2
     found = np.array([fit.layout.slope(y[:, channel], square, fit.weight[:, channel]) for channel in range(3)])
-    slope, noise = found[:, 0].mean() / EV, np.sqrt(np.mean(found[:, 1] ** 2)) / EV
+    return float(found[:, 0].mean()), float(np.sqrt(np.mean(found[:, 1] ** 2)))
+
+
+def vignetting_statistic(tracks: TrackColours, fit: ExposureFit) -> Statistic:
+    """By how much corners are darker than the middle, EV; below 0 they are brighter, which no lens makes them."""
+    if not fit.known.any():
+        return unknown("EV", THRESHOLD_EV, fit.unknown_because, False)
+    slope, noise = (figure / EV for figure in vignetting_slope(tracks, fit))
     if not np.isfinite(noise):
         return unknown("EV", THRESHOLD_EV, "every point lies at one radius in all photos", False)
     words = f"corners are {abs(slope):.2g} EV {'darker' if slope < 0 else 'brighter'} than the middle, ± {noise:.1g}"
-    return classify(float(abs(slope)), float(noise), THRESHOLD_EV, "EV", words)
+    return classify(-slope, noise, THRESHOLD_EV, "EV", words)
+
+
+def log_falloff(u: Float[np.ndarray, "*n"], falloff: Float[np.ndarray, "3"]) -> Float[np.ndarray, "*n"]:
+    """p(u) of nerf/effects/vignetting.py: 0 at the axis, the sum of the coefficients at the corner, where u is 1;
+    √u is nearly the distance from the axis in the image."""
+    first, second, third = falloff
+    return first * (1 - (1 - u) ** 3) + second * (3 * u**2 - 2 * u**3) + third * u**3

@@ -7,9 +7,9 @@ import torch
 
 from nerf.kernels import Backend
 from nerf.kernels import torch as reference
-from pipeline.doctor.numerics import Bound, Case, Measured, light, losses, measure, networks, space
+from pipeline.doctor.numerics import Bound, Case, Measured, effects, light, losses, measure, networks, space
 
-CASES: tuple[Case, ...] = (*space.CASES, *light.CASES, *losses.CASES, *networks.CASES)
+CASES: tuple[Case, ...] = (*space.CASES, *light.CASES, *effects.CASES, *losses.CASES, *networks.CASES)
 
 
 class Row(NamedTuple):

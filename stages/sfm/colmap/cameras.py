@@ -39,12 +39,24 @@ def border_rays(camera: Camera) -> Float[np.ndarray, "border 3"]:
     return _ray_directions(native(camera), np.concatenate(across + down))[0]
 
 
+def corner_chord_squared(camera: Camera) -> float:
+    """4 sin²(θ/2) of the largest angle θ between the optical axis and a pixel of a camera's image: the squared length
+    of the difference of their unit vectors."""
+    away = border_rays(camera) - [0.0, 0.0, 1.0]
+    return float((away**2).sum(axis=1).max())
+
+
 def share_without_ray(model: pycolmap.Camera) -> float:
     """Of a camera's pixels, seen at CHECKED_PIXELS of them, the share for which the camera model has no inverse."""
     sides = zip((model.width, model.height), CHECKED_PIXELS, strict=True)
     x, y = (np.linspace(0.5, length - 0.5, count) for length, count in sides)
     pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     return _ray_directions(model, pixels)[1] / len(pixels)
+
+
+def ray_directions(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    """Unit ray directions of pixels of the camera's own size; where it has no inverse, those of other pixels or NaN."""
+    return _ray_directions(native(camera), pixels)[0]
 
 
 def _ray_directions(model: pycolmap.Camera, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], int]:

@@ -156,6 +156,14 @@ def _adjust_thinned(
     model.update_point_3d_errors()
 
 
+def release_focal_lengths(model: pycolmap.Reconstruction) -> None:
+    """Adjust a model whose focal lengths were held while it was mapped, now with all of its images to tell them."""
+    bundle_adjust(model, set(), adjustment_options(False, noise_px(model, observations(model))))
+    limits = pycolmap.IncrementalMapperOptions()
+    pycolmap.ObservationManager(model).filter_all_points3D(limits.filter_max_reproj_error, limits.filter_min_tri_angle)
+    model.update_point_3d_errors()
+
+
 def bundle_adjust(
     model: pycolmap.Reconstruction,
     constant_cameras: set[int],

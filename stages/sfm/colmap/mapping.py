@@ -40,10 +40,15 @@ def map_incrementally(
 
 
 def incremental_options(
-    seed: int, mapping: MappingOptions, camera_is_known: bool, thinned: bool
+    seed: int, mapping: MappingOptions, camera_is_known: bool, thinned: bool, hold_focal: bool = False
 ) -> pycolmap.IncrementalPipelineOptions:
     """What mapping asks of images; a known camera is kept as it is. With ``thinned`` matches, those of many images,
-    global bundle adjustment runs less often: long tracks hold the images together in the meantime."""
+    global bundle adjustment runs less often: long tracks hold the images together in the meantime.
+
+    With ``hold_focal``, focal lengths that all pairs together tell are held: the first few images alone do not tell
+    them from distortion and depth; where adjustment runs away with them, every image after these is placed wrongly.
+    :func:`~stages.sfm.colmap.final_bundle_adjustment.release_focal_lengths` is for afterwards.
+    """
     options = pipeline_options(seed + mapping.seed_offset)
     if thinned:
         options.ba_global_frames_ratio = options.ba_global_points_ratio = BA_GLOBAL_RATIO
@@ -54,9 +59,8 @@ def incremental_options(
     # With thinned matches images have points enough; those that lack them have outliers, on which this takes minutes.
     options.structure_less_registration_fallback = mapping.structure_less_fallback and not thinned
     options.mapper.abs_pose_min_num_inliers = MIN_POSE_INLIERS
-    if camera_is_known:
-        options.ba_refine_focal_length = options.ba_refine_extra_params = False
-        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not (camera_is_known or hold_focal)
+    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = not camera_is_known
     return options
 
 

@@ -25,9 +25,9 @@ def read_model(sparse: Path) -> SparseModel:
     except (ValueError, OverflowError, OSError) as error:
         raise StageError(
             "sfm.damaged-model",
-            f"cannot read the COLMAP model in {sparse.name}",
+            f"cannot read the COLMAP model in {sparse}",
             str(error),
-            "Check that it is a complete COLMAP model.",
+            "Correct that or export the model again; or leave the cameras out, and they are found from the photos.",
         ) from error
     camera_ids = sorted(files.cameras)
     images = sorted(files.images.values(), key=lambda image: image.name)

@@ -5,6 +5,7 @@ tracks tie many photos together; where structure repeats, chance matches make sh
 the final adjustment brings back all matches (stages/sfm/colmap/final_bundle_adjustment.py).
 """
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -14,24 +15,29 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from stages.sfm.colmap.correspondences import Correspondences, read_correspondences
-from stages.sfm.colmap.database import finish_copy, keep_inliers, unfinished_copy
+from stages.sfm.colmap.database import FOCAL_GUESS, finish_copy, keep_inliers, unfinished_copy
 
 TRACKS_PER_PHOTO = 500  # of mapping: 1,000 take 1.7 times as long and move no camera by more (docs/stages/sfm.md)
+CALIBRATION_STARTS = 0.5, 2.0  # × the guess; where pairs tell the focal length, both lead to the same within 1 %
+MAX_START_RATIO = 1.1
+# Distortion, which calibration knows nothing of, puts it off by up to a sixth; a photo that was cropped by more.
+MAX_EXIF_RATIO = 1.3
 CELLS = 4  # of 4 × 4 parts of a photo each gives tracks in turn: those of one corner would leave the rest loose
 
 
-def thin_matches(database: Path, copy: Path, tracks: int = TRACKS_PER_PHOTO) -> None:
+def thin_matches(database: Path, copy: Path, tracks: int = TRACKS_PER_PHOTO, *, camera_is_known: bool = False) -> bool:
     """Copy the database with the verified matches of each photo's best ``tracks`` tracks alone.
 
-    Focal lengths that nothing tells are calibrated by all pairs together in the copy: mapping that begins with a guess
-    that is a fifth off can take minutes to leave it, or end with intrinsics that project everything wrongly.
+    Focal lengths are calibrated by all pairs together in the copy, unless the camera is known: mapping that begins with
+    a guess that is a fifth off can take minutes to leave it, or end with intrinsics that project everything wrongly.
+    Returns whether the pairs tell that of every camera.
     """
     unfinished = unfinished_copy(database, copy)
     with pycolmap.Database.open(unfinished) as db:
         geometries = dict(zip(*db.read_two_view_geometries(), strict=True))
         matches = read_correspondences(db, geometries)
         cells = _cells(db, len(matches.begins) - 1)
-    calibrate_focal_lengths(unfinished)
+    calibrated = not camera_is_known and calibrate_focal_lengths(unfinished)
     kept = best_tracks(matches, cells, tracks)[matches.keypoint[:, 0]]
     bounds = np.searchsorted(matches.pair, np.arange(len(matches.pairs) + 1))
     with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
@@ -39,6 +45,7 @@ def thin_matches(database: Path, copy: Path, tracks: int = TRACKS_PER_PHOTO) -> 
             geometry = geometries[pycolmap.image_pair_to_pair_id(first, second)]
             keep_inliers(db, (first, second), geometry, kept[bounds[number] : bounds[number + 1]])
     finish_copy(unfinished, copy)
+    return calibrated
 
 
 def _cells(db: pycolmap.Database, photos: int) -> Int[np.ndarray, "keypoints"]:
@@ -79,16 +86,58 @@ def _rank(group: Int[np.ndarray, "n"], *keys: Int[np.ndarray, "n"]) -> Int[np.nd
     return rank
 
 
-def calibrate_focal_lengths(database: Path) -> None:
-    """Where no focal length is known: those under which most fundamental matrices are essential ones (Sweeney et al.
-    2015, "Optimizing the viewing graph for structure-from-motion"). Nothing changes where the pairs do not tell."""
+def calibrate_focal_lengths(database: Path) -> bool:
+    """Focal lengths under which most fundamental matrices are essential ones (Sweeney et al. 2015, "Optimizing the
+    viewing graph for structure-from-motion"), where EXIF tells none or one that is far from it: that of a cropped
+    photo. Returns whether they are told for every camera.
+
+    They are believed where short and long ones to begin with lead to the same: photos whose axes meet in one point do
+    not tell them (Newsam et al. 1996, "Recovering unknown focal lengths in self-calibration"), planes neither. Nothing
+    changes there.
+    """
     with pycolmap.Database.open(database) as db:
-        before = db.read_all_cameras()
-    if any(camera.has_prior_focal_length for camera in before):
-        return
-    options = pycolmap.ViewGraphCalibrationOptions(random_seed=0, reestimate_relative_pose=False)
-    if pycolmap.calibrate_view_graph(database, options):
-        return
+        cameras = db.read_all_cameras()
+    if any(camera.model_name.endswith("FISHEYE") for camera in cameras):
+        return False  # two views through it have no fundamental matrix
+    by_short, by_long = (_calibrated(database, factor) for factor in CALIBRATION_STARTS)
+    told = {
+        camera: math.sqrt(short * long)
+        for camera, short in by_short.items()
+        if (long := by_long.get(camera)) and not _far_apart(short, long, MAX_START_RATIO)
+    }
     with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
-        for camera in before:
+        for camera in cameras:
+            focal_px, known = told.get(camera.camera_id), camera.has_prior_focal_length
+            if focal_px is None or (known and not _far_apart(focal_px, camera.mean_focal_length(), MAX_EXIF_RATIO)):
+                continue
+            _set_focal_length(camera, focal_px)
+            camera.has_prior_focal_length = True
             db.update_camera(camera)
+    return len(told) == len(cameras)
+
+
+def _calibrated(database: Path, factor: float) -> dict[int, float]:
+    """By camera the calibrated focal length, of those for which one is found, beginning with ``factor`` × a guess."""
+    copy = unfinished_copy(database, database.with_name(f"{database.stem}-calibration.db"))
+    with pycolmap.Database.open(copy) as db, pycolmap.DatabaseTransaction(db):
+        for camera in db.read_all_cameras():
+            _set_focal_length(camera, factor * FOCAL_GUESS * max(camera.width, camera.height))
+            camera.has_prior_focal_length = False  # those that count as known are not calibrated
+            db.update_camera(camera)
+    options = pycolmap.ViewGraphCalibrationOptions(random_seed=0, reestimate_relative_pose=False)
+    done = pycolmap.calibrate_view_graph(copy, options)
+    with pycolmap.Database.open(copy) as db:
+        cameras = db.read_all_cameras() if done else []
+    for file in copy.parent.glob(f"{copy.name}*"):
+        file.unlink()
+    return {camera.camera_id: camera.mean_focal_length() for camera in cameras if camera.has_prior_focal_length}
+
+
+def _far_apart(one: float, other: float, max_ratio: float) -> bool:
+    return not 1 / max_ratio < one / other < max_ratio
+
+
+def _set_focal_length(camera: pycolmap.Camera, focal_px: float) -> None:
+    params = np.array(camera.params)
+    params[camera.focal_length_idxs()] = focal_px
+    camera.params = params.tolist()

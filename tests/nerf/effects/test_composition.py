@@ -6,9 +6,9 @@ from torch import Tensor
 from nerf.effects import HeldOutImages, ImageEffects, Images, RayGradients, RenderedRays
 from nerf.effects.exposure import ExposureModel, expose
 from nerf.effects.pose_refinement import PoseRefinement
+from nerf.effects.vignetting import VignettingModel, falloff_terms
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
-from tests.nerf.effects.falloff import FalloffModel
 
 VIEW = torch.tensor([0, 2, 2, 1, 0])
 BACKGROUND = torch.tensor([0.9, 0.2, 0.4], dtype=torch.float64)
@@ -24,14 +24,15 @@ def rays() -> Rays:
 
 
 def images() -> Images:
-    return Images(torch.cat([torch.eye(3).repeat(3, 1, 1), drawn(3, 3, 3, 1)], dim=2).double())
+    """The first by one camera, the others by another one."""
+    poses = torch.cat([torch.eye(3).repeat(3, 1, 1), drawn(3, 3, 3, 1)], dim=2).double()
+    return Images(poses, torch.tensor([0, 1, 1]), torch.full((3,), 0.8).double())
 
 
 def colours() -> ImageEffects:
-    """A gain per photo, then a falloff towards its corners; other parameters for each photo."""
-    falloff = FalloffModel.initial(images())
-    falloff.slope += 0.3 * drawn(4, 3, 1)
-    return ImageEffects(colours=(ExposureModel(0.4 * drawn(5, 3, 3)), falloff))
+    """A gain per photo, then the vignetting of its camera."""
+    vignetting = VignettingModel(images(), 0.3 * drawn(4, 2, 3).abs(), 0.2 * drawn(14, 2, 1))
+    return ImageEffects(colours=(ExposureModel(0.4 * drawn(5, 3, 3)), vignetting))
 
 
 def refined(*seeds: int) -> ImageEffects:
@@ -53,15 +54,17 @@ def rendered(colour: Tensor, opacity: Tensor) -> RenderedRays:
 def test_colour_effects_act_in_order_on_the_scenes_own_radiance() -> None:
     effects, opacity = colours(), torch.tensor([1.0, 0.5, 0.2, 0.9, 0.0]).double()
     own, behind = 0.4 * opacity[:, None].expand(5, 3), (1 - opacity)[:, None] * BACKGROUND
-    exposure, falloff = effects.colours
-    gains, slope = exposure.parameters["log_gain"], falloff.parameters["slope"]
-    square = 1 / rays().directions[:, 2] ** 2 - 1  # tan² of the angle to the axis
-    shown = expose(expose(own, gains[VIEW]), (slope[VIEW, 0] * square)[:, None].expand(5, 3)) + behind
+    exposure, vignetting = effects.colours
+    gains, rows = exposure.parameters["log_gain"], vignetting.rows[VIEW]
+    axis = torch.tensor([[0.0, 0.0, 1.0]]).double().expand(5, 3)
+    terms = falloff_terms(rays().directions, axis, torch.full((5, 1), 1 / 0.8).double())
+    darker = (rows[:, 1:] * terms).sum(1, keepdim=True)
+    shown = expose(expose(own, gains[VIEW]), rows[:, :1] - darker) + behind
     residual = effects.residual(rendered(own + behind, opacity), torch.zeros(5, 3).double())
     torch.testing.assert_close(residual, shown)
     turned_about = ImageEffects(colours=effects.colours[::-1])
     assert not torch.equal(turned_about.parameters["exposure.log_gain"], gains + 1)
-    assert list(turned_about.parameters) == ["falloff.slope", "exposure.log_gain"]
+    assert list(turned_about.parameters) == ["vignetting.falloff", "exposure.log_gain"]
 
 
 def test_the_gradient_of_colour_effects_by_hand_is_their_derivative() -> None:
@@ -77,7 +80,7 @@ def test_the_gradient_of_colour_effects_by_hand_is_their_derivative() -> None:
     leaves += [parameter.requires_grad_() for parameter in effects.parameters.values()]
     assert torch.autograd.gradcheck(residual, leaves)
     expected = torch.autograd.grad((residual(*leaves) * weights).sum(), leaves)
-    names = ("exposure.log_gain", "falloff.slope")
+    names = ("exposure.log_gain", "vignetting.falloff")
     found = [by_hand.colour, by_hand.opacity, *(learnt[name] for name in names)]
     torch.testing.assert_close(found, list(expected), rtol=1e-10, atol=1e-12)
 
@@ -107,10 +110,11 @@ def test_without_ray_effects_no_gradient_of_rays_is_computed() -> None:
     assert colours().backward_rays(rays(), VIEW, costly) == {}
 
 
-def test_held_out_images_get_what_their_neighbours_have() -> None:
+def test_held_out_images_get_what_each_effect_expects_of_them() -> None:
     weights = torch.tensor([[0.25, 0.75, 0.0]]).double()
-    unseen = HeldOutImages(Images(images().scene_from_camera[:1]), weights)
+    unseen = HeldOutImages(Images(*(part[:1] for part in images()[:3])), weights)
     held_out, trained = colours().of_held_out(unseen), colours()
-    for name, rows in held_out.parameters.items():
-        torch.testing.assert_close(rows, weights @ trained.parameters[name])
+    exposure, vignetting = (effect.rows for effect in held_out.colours)
+    torch.testing.assert_close(exposure, weights @ trained.colours[0].rows)
+    torch.testing.assert_close(vignetting, trained.colours[1].rows[:1])
     assert not refined(8).of_held_out(unseen).rays

@@ -99,7 +99,7 @@ def test_extremes_are_finite_in_value_and_gradient(log_gain: float, kind: torch.
 
 
 def test_the_mean_gain_is_kept_by_the_gauge() -> None:
-    part = ExposureModel.initial(Images(torch.zeros(3, 3, 4)), GAINS)
+    part = ExposureModel.initial(Images(torch.zeros(3, 3, 4), VIEW[:3], torch.ones(3)), GAINS)
     assert torch.equal(part.log_gain.amin(0), torch.zeros(3).double())
     torch.testing.assert_close(part.log_gain - part.log_gain[:1], GAINS - GAINS[:1])
     before = part.log_gain.mean(0).clone()

@@ -65,7 +65,7 @@ def test_help_of_run_lists_the_stage_options(capsys: pytest.CaptureFixture[str])
         (["--budget", "10"], "'10' is not a duration; write it like 90s, 10m or 1h30m"),
         (["--budget", "2m", "--train.steps", "50"], "--budget 2m and --train.steps 50: so many steps take as "
          "long as they take; leave out one, or give --train.seconds"),
-        (["--budget", "2m", "--until", "tradeoff"], "--budget and --until tradeoff: a study has a budget of its own"),
+        (["--budget", "2m", "--until", "tradeoff"], "--budget and --until tradeoff: tradeoff is no part of"),
         (["--more", "9m", "--config", "a.toml"], "--more uses the recorded options, not those of --config "
          "a.toml; leave --config out, and give what is to change as flags"),
         (["--train.stepz", "5"], "Unrecognized options: --train.stepz, 5; perhaps --train.steps"),

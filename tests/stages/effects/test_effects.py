@@ -21,7 +21,14 @@ from stages.io.files import write_json
 from tests.effect_scenes import Effects, effect_scene
 from tests.stages.photo_scene import photographed
 
-CLEAR = {"exposure": False, "view_dependence": True, "background": True, "pose_refinement": False, "vignetting": True}
+CLEAR = {
+    "exposure": False,
+    "view_dependence": True,
+    "background": True,
+    "pose_refinement": False,
+    "vignetting": False,
+    "tone": True,
+}
 
 
 def found(called_for: bool | None, noise: float = 0.1) -> Statistic:
@@ -43,7 +50,7 @@ def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
         config: effects.Config, gain: float = 1.0, pilot: Callable | None = None, **given: Statistic
     ) -> tuple[Decisions, dict, str, list[str]]:
         told = {name: found(value) for name, value in CLEAR.items()} | given
-        measured = {"exposure": np.full((count, 3), 0.5)}
+        measured = {name: np.full((count, 3), 0.5) for name in ("exposure", "vignetting")}
         took = {name: 0.25 if name == "exposure" else 0.5 for name in told}
         monkeypatch.setattr(study, "scene_statistics", lambda *_: SceneStatistics(told, measured, took))
         tried: list[str] = []
@@ -68,10 +75,9 @@ def test_clear_evidence_decides_without_a_pilot(decided: Callable) -> None:
     assert decisions == Decisions({"view_dependence": {}, "background": {}})
     assert not tried
     assert line == (
-        "background on (one of two) · view dependence on (one of two) · 3 off · "
-        "seen, not modelled: vignetting (one of two)"
+        "background on (one of two) · view dependence on (one of two) · 4 off · seen, not modelled: tone (one of two)"
     )
-    assert table["vignetting"]["seconds"] == 0.5
+    assert table["tone"]["seconds"] == 0.5
     assert table["camera_model"]["seconds"] == 0.0, "stage sfm chose it"
     assert table["exposure"] == {
         "on": False,
@@ -86,7 +92,7 @@ def test_clear_evidence_decides_without_a_pilot(decided: Callable) -> None:
         "seconds": 0.25,
         "reason": "one of two",
     }
-    assert table["vignetting"]["on"] and not table["vignetting"]["modelled"]
+    assert table["tone"]["on"] and not table["tone"]["modelled"]
 
 
 @pytest.mark.parametrize(("gain", "on"), [(0.3, True), (0.15, False), (-1.0, False)])
@@ -106,10 +112,11 @@ def test_view_dependence_is_left_out_only_where_that_gains(
     assert tried == ["view_dependence"] and ("view_dependence" in decisions.on) is on
 
 
-def test_gains_go_to_training_by_the_names_of_its_photos(decided: Callable) -> None:
-    decisions, *_ = decided(effects.Config(), exposure=found(True))
-    assert set(decisions.on["exposure"]) == {f"{i}.png" for i in (1, 2, 3, 5, 6, 7, 9, 10)}
-    assert all(gain == [0.5] * 3 for gain in decisions.on["exposure"].values())
+@pytest.mark.parametrize("name", ["exposure", "vignetting"])
+def test_what_was_measured_goes_to_training_by_photo(decided: Callable, name: str) -> None:
+    decisions, *_ = decided(effects.Config(), **{name: found(True)})
+    assert set(decisions.on[name]) == {f"{i}.png" for i in (1, 2, 3, 5, 6, 7, 9, 10)}
+    assert all(numbers == [0.5] * 3 for numbers in decisions.on[name].values())
 
 
 def test_clearly_wrong_poses_are_refined_without_a_pilot(decided: Callable) -> None:
@@ -149,7 +156,7 @@ def test_what_nothing_is_known_of_is_not_tried(decided: Callable) -> None:
 
 @pytest.mark.parametrize("value", ["on", "off"])
 def test_what_was_asked_for_is_done(decided: Callable, value: effects.Switch) -> None:
-    names = ("exposure", "view_dependence", "background", "pose_refinement")
+    names = ("exposure", "view_dependence", "background", "pose_refinement", "vignetting")
     config = effects.Config(force=dict.fromkeys(names, value))
     decisions, table, _, tried = decided(config, exposure=found(None))
     assert not tried and set(decisions.on) == (set(names) if value == "on" else set())
@@ -164,7 +171,7 @@ def training_key(effects_folder: Path) -> str:
 
 @pytest.mark.parametrize("said", [False, None])
 def test_switched_off_by_evidence_trains_as_off_by_option(decided: Callable, tmp_path: Path, said: bool | None) -> None:
-    names = ("exposure", "view_dependence", "background", "pose_refinement")
+    names = ("exposure", "view_dependence", "background", "pose_refinement", "vignetting")
     told = {name: found(said if name in ("exposure", "pose_refinement") else False) for name in names}
     by_evidence, *_ = decided(effects.Config(pilots=3), -1.0, **told)
     all_off = effects.Config(force=dict.fromkeys(names, "off"))
@@ -185,6 +192,7 @@ def test_decisions_are_read_as_they_were_written(tmp_path: Path) -> None:
     ("made", "on"),
     [
         (Effects(exposure_ev=1.0), {"background", "exposure", "view_dependence"}),
+        (Effects(vignetting_ev=1.0), {"background", "vignetting", "view_dependence"}),
         (Effects(highlight=1.0, alpha=True), {"view_dependence"}),
     ],
 )

@@ -159,7 +159,7 @@ def test_the_exposure_expected_of_an_unseen_photo_is_its_neighbours(inputs: dict
     scene = read_scene(inputs["normalise"])
     train, test = scene.of_split("train"), scene.of_split("test")
     photos = {view.name: [0.1 * i, 0.0, -0.1] for i, view in enumerate(train)}
-    weights = held_out_images(train, test).weights
+    weights = held_out_images(scene, train, test).weights
     assert weights.shape == (len(test), len(train))
     for row, view in zip(weights, test, strict=True):
         (exposure,) = photo_effects({"effects": {"exposure": photos}}, scene, view)

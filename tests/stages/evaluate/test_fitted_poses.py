@@ -69,7 +69,7 @@ def test_refined_poses_are_written_in_scene_units(tmp_path: Path) -> None:
     views = scene.of_split("train")
     dataset = training_dataset(inputs["ingest"], scene, "train", 1.0, SilentDisplay())
     near = dataset._replace(sparse_pixels=dataset.first_pixel[:-1] + 5, sparse_depths=torch.full((len(views),), 0.25))
-    effects = image_effects(Decisions({"pose_refinement": {}}), views, near)
+    effects = image_effects(Decisions({"pose_refinement": {}}), scene, views, near)
     effects.rays[0].parameters["offset"][1] = torch.tensor([1.0, 0.0, -2.0])
     learnt = learnt_effects(effects, views)["pose_refinement"]
     assert learnt[views[1].name] == [0.0, 0.0, 0.0, 0.25, 0.0, -0.5] and learnt[views[0].name] == [0.0] * 6

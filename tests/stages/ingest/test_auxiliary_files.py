@@ -14,7 +14,7 @@ from PIL import Image
 
 from stages import ingest
 from stages.ingest import Config
-from stages.ingest.auxiliary_files import Stored, auxiliary_files, depth_maps, is_mask
+from stages.ingest.auxiliary_files import ALL_PHOTOS, Stored, auxiliary_files, depth_maps, is_mask
 from stages.ingest.sources import find_source, unused_masks
 from stages.io.photos import read_photos
 from tests.stages.ingest.test_sources import touch
@@ -80,11 +80,18 @@ names_of_files = st.lists(
 @given(names_of_files)
 def test_every_twin_leads_to_a_photo_that_stays(names: list[str]) -> None:
     found = auxiliary_files(names)
-    assert set(found) <= set(names) >= set(found.values())
+    assert set(found) <= set(names) >= set(found.values()) - {ALL_PHOTOS}
     for name in found:
         for _ in names:
             name = found.get(name, name)
         assert name not in found
+    assert len(found) < max(1, len(names))
+
+
+@pytest.mark.parametrize("name", ["mask.png", "Masks.PNG", "camera_mask.png"])
+def test_one_mask_of_all_photos_is_no_photo(name: str) -> None:
+    assert auxiliary_files(["a.jpg", "b.jpg", name]) == {name: ALL_PHOTOS}
+    assert auxiliary_files([name]) == {}
 
 
 def test_a_map_belongs_to_a_photo() -> None:

@@ -74,8 +74,20 @@ def test_a_linked_photo_folder_may_lack_its_cameras(tmp_path: Path) -> None:
     assert "pipeline run PHOTOS --cameras FILE" in refusal(cameras).hint
     for photos in ("set/images", "set"):
         assert names(find_source(tmp_path / photos, cameras)) == ["a.jpg"]
-    (tmp_path / "disk/images/b.jpg").symlink_to(tmp_path / "secret.jpg")
-    assert refusal(tmp_path / "set", transforms(cameras, "images/b.jpg")).what == "rejected the photo 'images/b.jpg'"
+
+
+def test_links_to_photos_are_followed_in_given_folders(tmp_path: Path) -> None:
+    """As they are without cameras; a transforms file alone opens nothing outside of its folder."""
+    touch(tmp_path, "store/a.jpg", "store/deep/b.jpg", "set/images/c.jpg")
+    (tmp_path / "set/images/a.jpg").symlink_to(tmp_path / "store/a.jpg")
+    (tmp_path / "set/images/deep").symlink_to(tmp_path / "store/deep")
+    cameras = transforms(tmp_path / "set/transforms.json", "images/a.jpg", "images/c.jpg")
+    assert refusal(cameras).what == "rejected the photo 'images/a.jpg'"
+    for photos in ("set/images", "set"):
+        assert names(find_source(tmp_path / photos, cameras)) == ["a.jpg", "c.jpg"]
+    elsewhere = transforms(tmp_path / "t.json", "/home/me/a.jpg", "/home/me/c.jpg")
+    assert names(find_source(tmp_path / "set/images", elsewhere)) == ["a.jpg", "c.jpg"]
+    assert refusal(tmp_path / "set", transforms(cameras, "images/deep/b.jpg")).what.startswith("rejected the photo")
 
 
 @pytest.mark.parametrize(
@@ -106,10 +118,41 @@ def test_a_missing_photo_is_not_replaced_by_its_namesake(tmp_path: Path) -> None
     assert "right/1.jpg" in names(find_source(transforms(tmp_path / "transforms.json", "left/0.jpg", "right/1.jpg")))
 
 
-def test_ends_that_two_photos_share_tell_nothing(tmp_path: Path) -> None:
-    touch(tmp_path, "a/0.jpg", "b/0.jpg")
-    error = refusal(transforms(tmp_path / "transforms.json", "elsewhere/0.jpg"))
-    assert "none of the 1 photos" in error.what and "elsewhere/0.jpg" in error.why and "a/0.jpg" in error.why
+@pytest.mark.parametrize("written", ["elsewhere/0.jpg", "/home/me/0.jpg", "C:\\set\\0.jpg", "../0.png"])
+def test_ends_that_two_photos_share_are_named(tmp_path: Path, written: str) -> None:
+    touch(tmp_path, "a/0.jpg", "b/0.jpg", "c/1.jpg")
+    others = [] if written[0] == "e" else ["/home/me/1.jpg"]
+    error = refusal(transforms(tmp_path / "transforms.json", written, *others))
+    assert (error.code, error.what) == ("ingest.ambiguous-path", f"cannot tell which photo {written!r} is")
+    assert "a/0.jpg, b/0.jpg" in error.why and str(tmp_path) in error.hint
+
+
+@pytest.mark.parametrize(
+    "written", ["images/photo%201%20%C3%A9.jpg", "file:///home/me/photo%201%20é.jpg", "file://C:/me/photo%201%20é.jpg"]
+)
+def test_paths_may_be_urls(tmp_path: Path, written: str) -> None:
+    touch(tmp_path, "images/photo 1 é.jpg", "images/100%25.jpg")
+    source = find_source(transforms(tmp_path / "transforms.json", written, "images/100%25.jpg"))
+    assert list(source.frames.values()) == ["images/photo 1 é.jpg", "images/100%25.jpg"]
+
+
+def test_a_url_leads_out_of_no_folder(tmp_path: Path) -> None:
+    touch(tmp_path, "secret.jpg", "set/b.jpg")
+    assert refusal(transforms(tmp_path / "set/transforms.json", "b.jpg", "%2e%2e/secret.jpg")).code == (
+        "ingest.outside-folder"
+    )
+
+
+def test_photos_of_another_ending_are_taken_where_none_is_there(tmp_path: Path) -> None:
+    touch(tmp_path, "images/0.jpg", "images/1.jpg", "images/2.tif")
+    written = ["images/0.png", "images/1.png", "images/2.png"]
+    source = find_source(transforms(tmp_path / "transforms.json", *written))
+    assert list(source.frames.values()) == ["images/0.jpg", "images/1.jpg", "images/2.tif"]
+    assert dict(source.other_endings) == source.frames
+    touch(tmp_path, "images/0.png")
+    source = find_source(transforms(tmp_path / "transforms.json", *written))
+    assert source.frames["images/1.png"] == "images/1.png", "of a set that is there nothing is guessed"
+    assert source.other_endings == {}
 
 
 def test_an_end_leads_to_nothing_outside(tmp_path: Path) -> None:

@@ -258,7 +258,7 @@ def test_masks_go_with_their_photos(tmp_path: Path, progress: Any) -> None:
         assert photo.mask == file
         assert np.array_equal(mask, np.broadcast_to(np.where(np.arange(32) < columns, 0, 255), (24, 32)))
     assert progress.notes == [
-        "masks/stranger.png is no photo's mask, which are called NAME.png",
+        "masks/stranger.png is no photo's mask: masks are called after their photos, masks/NAME.png",
         "masks of 3 of 6 photos ignore 42% of them, 1 turned upright like the photo, 1 made as large as the photo",
     ]
 

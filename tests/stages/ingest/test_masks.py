@@ -85,6 +85,42 @@ def test_what_is_used_may_be_one_or_white(used: int, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_mask(saved(tmp_path, mask), WIDTH, HEIGHT, 1).pixels, ignoring(10, 20))
 
 
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("values", [(1, 1), (1, 2), (7, 100)])
+def test_of_labels_all_but_zero_is_used(bits: int, values: tuple[int, int], tmp_path: Path) -> None:
+    """As COLMAP and nerfstudio have it."""
+    labels = np.where(np.arange(WIDTH) < 20, *values).astype(np.uint8 if bits == 8 else np.uint16)
+    file = saved(tmp_path, np.where(ignoring(30, 20) > 0, labels, labels.dtype.type(0)))
+    found = read_mask(file, WIDTH, HEIGHT, 1)
+    np.testing.assert_array_equal(found.pixels, ignoring(30, 20))
+    assert not found.grey
+
+
+def test_what_compression_leaves_of_black_is_no_label(tmp_path: Path) -> None:
+    file = tmp_path / "m.jpg"
+    Image.fromarray(np.random.default_rng(0).integers(0, 9, (HEIGHT, WIDTH), np.uint8)).save(file)
+    assert "ignores all of it" in reason(file)
+
+
+def test_a_picture_that_is_cut_out_masks_by_its_alpha(tmp_path: Path) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    cut = read_mask(saved(tmp_path, np.dstack([picture, ignoring(20, 10)])), WIDTH, HEIGHT, 1)
+    np.testing.assert_array_equal(cut.pixels, ignoring(20, 10))
+    assert not cut.grey
+    assert read_mask(saved(tmp_path, picture), WIDTH, HEIGHT, 1).grey
+    assert not read_mask(saved(tmp_path, ignoring(20, 10)), WIDTH, HEIGHT, 1).grey
+
+
+def test_masks_may_say_that_they_are(tmp_path: Path) -> None:
+    strange = ["d_mask.png", "e_mask.png", "mask_e.png", "masks.png"]
+    files = ["a_mask.png", "mask_b.png", "left/c.mask.jpg", "d.png", *strange]
+    named = [(name, tmp_path / name) for name in files]
+    paired, strays = pair_masks(["a.jpg", "b.jpg", "left/c.jpg", "d.jpg", "e.jpg"], named)
+    of = {"a.jpg": "a_mask.png", "b.jpg": "mask_b.png", "left/c.jpg": "left/c.mask.jpg", "d.jpg": "d.png"}
+    assert paired == {photo: tmp_path / mask for photo, mask in of.items()}
+    assert strays == [tmp_path / name for name in strange]
+
+
 def test_masks_may_be_jpegs(tmp_path: Path) -> None:
     paired, strays = pair_masks(["a.jpg", "b.jpg"], [("a.jpg", tmp_path / "a.jpg"), ("b.jpg.JPG", tmp_path / "b.JPG")])
     assert paired == {"a.jpg": tmp_path / "a.jpg", "b.jpg": tmp_path / "b.JPG"} and strays == []
@@ -199,8 +235,10 @@ def test_an_unusable_mask_refuses_its_photo(tmp_path: Path) -> None:
         "its mask m.png does not fit: it is 40×40 and the photo 48×32"
     )
     assert reason(saved(tmp_path, ignoring(5, 5, HEIGHT, WIDTH))).startswith("its mask m.png does not fit")
-    labels = np.minimum(ignoring(5, 5), 3)
-    assert reason(saved(tmp_path, labels)) == "its mask m.png ignores all of it (its brightest value is 3 of 255)"
+    black = saved(tmp_path, np.zeros((HEIGHT, WIDTH), np.uint8))
+    assert reason(black) == "its mask m.png ignores all of it (its brightest value is 0 of 255)"
+    hidden = np.dstack([np.zeros((HEIGHT, WIDTH, 3), np.uint8), ignoring(5, 5)])
+    assert reason(saved(tmp_path, hidden)).endswith("0 of 255, where it is not transparent)")
     (tmp_path / "t.png").write_text("text")
     assert reason(tmp_path / "t.png") == "its mask t.png cannot be used: not an image: it is text"
 

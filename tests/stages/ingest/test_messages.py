@@ -39,15 +39,16 @@ def test_all_notes_are_kept(tmp_path: Path, progress: Any) -> None:
     folder = put(tmp_path / "in", "a.jpg", "b.jpg")
     for index in range(7):
         put(folder / "masks", f"stray{index}.png")
-    for index in range(5):
+    for index in range(11):
         frames = [picture(10 * index + frame) for frame in range(2)]
-        frames[0].save(folder / f"c{index}.tif", save_all=True, append_images=frames[1:])
+        frames[0].save(folder / f"c{index:02d}.tif", save_all=True, append_images=frames[1:])
     result = ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
     assert (result.records, result.outputs) == (("notes.json",), ("images", "photos.json"))
     notes = read_json(tmp_path / "out/notes.json")
     assert notes[:10] == progress.notes[:10] and len(notes) == 12
-    assert notes[6] == "masks/stray6.png is no photo's mask, which are called NAME.png"
-    assert notes[7].startswith("c0.tif: ")
+    strays = "masks/stray0.png, masks/stray1.png, masks/stray2.png and 4 more"
+    assert notes[0] == f"{strays} are no photo's mask: masks are called after their photos, masks/NAME.png"
+    assert notes[1].startswith("c00.tif: ")
     assert progress.notes[10] == "… and 2 more, all in notes.json"
 
 
@@ -81,7 +82,7 @@ def test_where_it_fails_all_refusals_are_said_by_reason(tmp_path: Path, progress
     assert progress.notes == [
         f"rejected {names}: not an image: it is text",
         "rejected y.jpg: identical to a.jpg",
-        "masks/stray.png is no photo's mask, which are called NAME.png",
+        "masks/stray.png is no photo's mask: masks are called after their photos, masks/NAME.png",
     ]
 
 

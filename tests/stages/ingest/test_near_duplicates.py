@@ -1,5 +1,7 @@
 """Pictures of which one is enough, and pictures that only look alike."""
 
+from itertools import product
+
 import cv2
 import numpy as np
 import pytest
@@ -177,6 +179,21 @@ def test_of_brackets_the_best_exposed_is_kept_the_same_everywhere() -> None:
     found, pattern = well_exposed(lightest, exposures, [100] * 10)
     assert found == {1: 0, 2: 0, 4: 3, 5: 3, 7: 6, 8: 6}
     assert pattern == Brackets(3, 3, 1)
+
+
+@pytest.mark.parametrize(
+    ("stops", "best", "by_exposure"),
+    [((0, -2), 0, False), ((0, 2), 0, False), ((0, -1, 1, -2, 2), 1, False), ((2, 0, -2), 0, True)],
+)
+def test_pictures_of_brackets_keep_the_well_exposed(stops: tuple[int, ...], best: int, by_exposure: bool) -> None:
+    """Pairs, five exposures (these places are dark), and exposures that are folders of their own."""
+    places = [np.clip(0.4 * seen(60 * place - 40) + 40, 0, 255).astype(np.uint8) for place in range(2)]
+    order = [(place, ev) for ev in stops for place in range(2)] if by_exposure else list(product(range(2), stops))
+    pictures = [exposed(places[place], ev) for place, ev in order]
+    same = near_duplicates([thumbnail(p) for p in pictures], [sharpness(p) for p in pictures], [1] * len(pictures))
+    left_out, pattern = well_exposed(same, [exposure(p) for p in pictures], [1] * len(pictures))
+    assert [order[i] for i in range(len(order)) if i not in left_out] == [(0, best), (1, best)]
+    assert pattern == Brackets(2, len(stops), sorted(stops).index(best))
 
 
 def test_one_place_with_several_exposures_is_no_pattern() -> None:

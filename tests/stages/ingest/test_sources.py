@@ -11,7 +11,16 @@ import pytest
 
 from stages.contract import StageError
 from stages.ingest.auxiliary_files import pair_masks
-from stages.ingest.sources import Source, camera_files, find_source, is_gone, photos_beside
+from stages.ingest.sources import (
+    Source,
+    camera_files,
+    find_source,
+    is_gone,
+    mask_beside,
+    photos_beside,
+    unused_cameras,
+    unused_masks,
+)
 from tests.refusals import refused
 
 
@@ -201,9 +210,9 @@ def test_frames_may_not_leave_their_folder(tmp_path: Path, file_path: str) -> No
     (tmp_path / "scene/link").symlink_to(tmp_path)
     error = refusal(transforms(tmp_path / "scene/transforms.json", "images/a.jpg", file_path))
     assert error.what == f"rejected the photo {file_path!r}"
-    of_link = "Give the photo folder apart, if it is a link: pipeline run PHOTOS --cameras FILE."
-    of_name = "A transforms file may name photos inside its own folder only."
-    assert error.hint == (of_link if file_path.startswith("link") else of_name)
+    assert error.hint == "Give the folder of the photos apart: pipeline run PHOTOS --cameras FILE"
+    apart = refusal(tmp_path / "scene", tmp_path / "scene/transforms.json")
+    assert apart.what == error.what and f"inside {tmp_path}/scene/images only" in apart.hint
 
 
 @pytest.mark.parametrize(
@@ -225,6 +234,17 @@ def test_frames_may_not_leave_their_folder(tmp_path: Path, file_path: str) -> No
 def test_a_transforms_file_that_is_none(tmp_path: Path, content: str, why: str) -> None:
     (tmp_path / "transforms.json").write_text(content)
     assert refusal(tmp_path / "transforms.json").why.startswith(why)
+
+
+def test_a_transforms_file_without_its_photos(tmp_path: Path) -> None:
+    touch(tmp_path, "photos/DSC_1.jpg", "photos/DSC_2.jpg")
+    cameras = transforms(tmp_path / "transforms.json", "images/frame_1.jpg", "images/frame_2.jpg")
+    error = refusal(tmp_path / "photos", cameras)
+    assert (error.code, error.what) == (
+        "ingest.cameras-of-other-photos",
+        "none of the 2 photos of transforms.json is there",
+    )
+    assert "images/frame_1.jpg" in error.why and f"{tmp_path}/photos has DSC_1.jpg" in error.why
 
 
 def test_words_for_what_cannot_be_used(tmp_path: Path) -> None:
@@ -263,9 +283,34 @@ def test_words_for_cameras_that_cannot_be_used(tmp_path: Path) -> None:
     assert refusal(cameras, cameras).what == "two sources of cameras"
     touch(tmp_path, "images.bin", "cameras.txt", "cams.csv")
     for name in ("images.bin", "cameras.txt"):
-        hint = f"Give the folder of the COLMAP model: --cameras {tmp_path}"
-        assert refusal(tmp_path / "photos", tmp_path / name).hint == hint
-    assert refusal(tmp_path / "photos", tmp_path / "cams.csv").hint.endswith("cameras in other forms are not read.")
+        assert refusal(tmp_path / "photos", tmp_path / name).hint == f"Give its folder: --cameras {tmp_path}"
+    for name, what, hint in (
+        ("cams.csv", "as RealityScan writes it", "ns-process-data realitycapture"),
+        ("cams.xml", "as Metashape writes it", "ns-process-data metashape"),
+        ("database.db", "no poses", "sparse/0"),
+        ("bundle.out", "a Bundler file", "leave --cameras out"),
+        ("cams.xyz", "of another kind", "leave --cameras out"),
+    ):
+        error = refusal(tmp_path / "photos", touch(tmp_path, name) / name)
+        assert name in error.what and what in error.why and hint in error.hint
+
+
+def test_what_is_missing_of_a_colmap_model_is_named(tmp_path: Path) -> None:
+    touch(tmp_path, "photos/a.jpg", "db/database.db", "half/sparse/0/cameras.txt", "half/sparse/0/rigs.txt", "m/a.ply")
+    assert "database.db holds COLMAP's features" in refusal(tmp_path / "photos", tmp_path / "db").why
+    assert "there is only cameras.txt" in refusal(tmp_path / "photos", tmp_path / "half/sparse/0").why
+    assert refusal(tmp_path / "photos", tmp_path / "m").why.endswith("there is a.ply")
+
+
+@pytest.mark.parametrize("place", ["colmap/sparse/0", "dense/0/sparse", "a/b/c/d"])
+def test_a_colmap_model_may_lie_deeper(tmp_path: Path, place: str) -> None:
+    touch(tmp_path, "images/a.jpg", *(f"{place}/{name}" for name in COLMAP), "old.nerf/run.json", ".git/x")
+    touch(tmp_path, *(f"{hidden}/sfm/{name}" for hidden in ("old.nerf", ".git") for name in COLMAP))
+    assert find_source(tmp_path / "images", tmp_path).cameras == tmp_path / place
+    unused = unused_cameras(find_source(tmp_path))
+    assert unused == (tmp_path / place if place[0] != "a" else None)
+    touch(tmp_path, *(f"sparse/0/{name}" for name in COLMAP))
+    assert find_source(tmp_path / "images", tmp_path).cameras == tmp_path / "sparse/0"
 
 
 @pytest.mark.parametrize(("name", "kind"), [("transforms.json", "transforms"), ("transforms_train.json", "blender")])
@@ -295,6 +340,36 @@ def test_a_video_or_a_folder_with_nothing_else(tmp_path: Path, given: str) -> No
         "decided by ingest: no poses can be imported for them. "
         "Leave --cameras out, or give the folder of the photos that the cameras belong to."
     )
+
+
+@pytest.mark.parametrize(
+    ("photos", "masks"),
+    [
+        ("images", "Masks"),
+        ("images_4", "masks_4"),
+        ("images_4", "masks"),
+        ("images_4", "MASKS_4"),
+        ("images", "images/Masks"),
+    ],
+)
+def test_folders_of_masks_by_other_names(tmp_path: Path, photos: str, masks: str) -> None:
+    touch(tmp_path, f"{photos}/a.jpg", f"{masks}/a.png")
+    assert find_source(tmp_path / photos).masks == (("a.png", tmp_path / masks / "a.png"),)
+
+
+def test_one_mask_beside_photos_is_found(tmp_path: Path) -> None:
+    touch(tmp_path, "images/a.jpg", "images/b.jpg", "Mask.png", "c.jpg")
+    source = find_source(tmp_path)
+    assert mask_beside(source, tmp_path) == tmp_path / "Mask.png" and photos_beside(source, tmp_path) == 1
+    assert mask_beside(find_source(tmp_path / "images"), tmp_path / "images") is None
+
+
+def test_masks_of_reduced_photos_go_before_others(tmp_path: Path) -> None:
+    touch(tmp_path, "images_4/a.jpg", "masks/a.png", "masks_4/a.png", "masks_8/a.png")
+    source = find_source(tmp_path / "images_4")
+    assert source.masks == (("a.png", tmp_path / "masks_4/a.png"),)
+    other = find_source(touch(tmp_path, "other/images/a.jpg", "other/mask_2/a.png") / "other")
+    assert other.masks == () and unused_masks(other) == tmp_path / "other/mask_2"
 
 
 def test_masks_are_listed_by_their_names_without_folder(tmp_path: Path) -> None:

@@ -121,14 +121,21 @@ def test_colours_may_be_written_as_decimals(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "line", "why"),
     [
-        ("images", "7 1 0 0 0 1 2", "line 1: an image (its line of keypoints, below it, may be empty) has 7 fields"),
-        ("images", "7 1 0 0 0 x 0 0 1 a.png\n", "line 1: could not convert string to float: 'x'"),
+        (
+            "images",
+            "7 1 0 0 0 1 2",
+            "line 1: an image (id, quaternion, translation, camera, name; below it a line of keypoints or none) has 7",
+        ),
+        ("images", "7 1 0 0 0 x 0 0 1 a.png\n", "line 1: 'x' is no number"),
         ("images", "7 1 0 0 0 0 0 0 1 a.png\n1 2 3 4", "line 2: keypoints are triples"),
         ("images", "7 1 0 0 0 0 0 0 1 0007\n8 1 0 0 0 0 0 0 1 0008", "line 2: keypoints are triples"),
         ("points3D", "7 0 0 0 1 2 300 0.5", "line 1: a colour is not between 0 and 255"),
-        ("points3D", "7 0 0 0 1 2 3", "line 1: a point has 7 fields where 8 belong"),
+        ("points3D", "7 0 0 0 1 2", "line 1: a point has 6 fields where 7 belong"),
+        ("images", "7 1 0 0 0 0,5 0 0 1 a.png\n", "line 1: '0,5' is no number"),
+        ("images", "7 1 0 0 0 0 0 0 1.5 a.png\n", "line 1: '1.5' is no whole number"),
+        ("cameras", "7, PINHOLE, 60, 40, 1, 1, 1, 1", "line 1: '7,' is no whole number"),
         ("cameras", "7 PINHOLE 60", "line 1: a camera has 3 fields where 4 belong"),
-        ("cameras", "7 PINHOLE 60 40.5 1 1 1 1", "line 1: invalid literal"),
+        ("cameras", "7 PINHOLE 60 40.5 1 1 1 1", "line 1: '40.5' is no whole number"),
     ],
 )
 def test_a_damaged_line_is_named(name: str, line: str, why: str, tmp_path: Path) -> None:
@@ -137,6 +144,32 @@ def test_a_damaged_line_is_named(name: str, line: str, why: str, tmp_path: Path)
     with pytest.raises(StageError) as caught:
         read_model(tmp_path)
     assert f"{name}.txt is damaged: {why}" in caught.value.why
+
+
+def test_text_that_can_only_mean_one_thing(tmp_path: Path) -> None:
+    """Whole numbers such as 1.0, camera models in small letters, points that end with their colour, UTF-16."""
+    whole = read_model(written(tmp_path))
+    files = {name: tmp_path / f"{name}.txt" for name in ("cameras", "images", "points3D")}
+    rows = {name: [line.split() for line in file.read_text().splitlines()] for name, file in files.items()}
+    for row in rows["cameras"]:
+        if row[0] != "#":
+            row[0], row[1], row[2], row[3] = f"{row[0]}.0", row[1].lower(), f"{row[2]}.0", f"{row[3]}e0"
+    rows["points3D"] = [row[:7] for row in rows["points3D"]]
+    for name, file in files.items():
+        file.write_text("\r\n".join(map(" ".join, rows[name])), "utf-16")
+    read = read_model(tmp_path)
+    assert read.cameras == whole.cameras and len(read.images) == len(whole.images)
+    np.testing.assert_array_equal(read.xyz, whole.xyz)
+    np.testing.assert_array_equal(read.rgb, whole.rgb)
+    np.testing.assert_array_equal(read.xy, whole.xy)
+    np.testing.assert_array_equal(read.error_px, 0)
+
+
+def test_points_that_were_emptied_are_left_out_of_images(tmp_path: Path) -> None:
+    written(tmp_path)
+    (tmp_path / "points3D.txt").write_text("# 3D point list\n")
+    read = read_model(tmp_path)
+    assert len(read.images) == 3 and len(read.xyz) == len(read.view) == 0
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-9, 1.0, 1e9, 1e300])

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from stages.io.files import write_json
+from stages.report.plots import BLUE
 from tests.stages.report.report_workspace import make_workspace, written
 
 
@@ -100,6 +101,21 @@ def test_page_shows_what_the_photos_call_for(tmp_path: Path, progress: Any):
         "tone: &lt;i&gt;smeared&lt;/i&gt; (4 px, threshold 2.5 px). Turn off automatic contrast, HDR and filters, or "
         "develop all photos with one curve."
     ]
+
+
+def test_page_shows_the_curve_of_each_cameras_vignetting(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path) | {"effects": tmp_path / "effects"}
+    inputs["effects"].mkdir()
+    write_json(inputs["effects"] / "manifest.json", json.loads((inputs["mesh"] / "manifest.json").read_text("utf-8")))
+    write_json(inputs["effects"] / "effects.json", EFFECTS)
+    field = json.loads((inputs["train"] / "field.json").read_text("utf-8"))
+    rows = {"a.png": [0.4, 0.1, 0.1, 0.2], "b.png": [0.4, 0.1, 0.1, 0.2], "c.png": [0.4, 0.0, 0.0, 0.1]}
+    write_json(inputs["train"] / "field.json", field | {"effects": {"vignetting": rows}})
+    html, _ = written(inputs, tmp_path / "out", progress)
+    drawn = html[html.index('aria-label="gain against') : html.index("Vignetting as it was learnt")]
+    assert drawn.count(BLUE) == 2, "two cameras"
+    write_json(inputs["train"] / "field.json", field | {"effects": {}})
+    assert "Vignetting as it was learnt" not in written(inputs, tmp_path / "without", progress)[0]
 
 
 def test_without_flags_there_is_no_list_of_them(tmp_path: Path, progress: Any):

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stages.sfm.geometry_check import (
+    CONTRADICTION_FACTOR,
     MIN_PAIR_MATCHES,
     PairMatches,
     _median_of_others,
@@ -127,6 +128,17 @@ def test_a_group_without_pairs_to_the_rest_is_unlinked() -> None:
     kept = (matches.pairs[:, 0] < 7) == (matches.pairs[:, 1] < 7)
     check = check_poses(restricted(matches, kept), poses)
     assert np.flatnonzero(check.unlinked).tolist() == list(range(7)) and not check.misplaced.any()
+
+
+def test_a_photo_that_no_pair_agrees_with_is_unlinked() -> None:
+    """Its one pair is off, though too little to contradict its pose: nothing supports where it is."""
+    matches, poses = walk()
+    last = len(poses) - 1
+    matches = restricted(matches, (matches.pairs[:, 1] != last) | (matches.pairs[:, 0] == last - 1))
+    check = check_poses(matches, moved(poses, [last], degrees=0.2))
+    error = check.pair_error_px[matches.pairs[:, 1] == last]
+    assert check.tolerance_px < error < CONTRADICTION_FACTOR * check.tolerance_px
+    assert np.flatnonzero(check.unlinked).tolist() == [last] and not check.misplaced.any()
 
 
 def test_a_single_pair_across_is_a_weak_link() -> None:

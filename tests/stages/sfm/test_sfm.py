@@ -161,7 +161,7 @@ def test_strangers_are_named_alpha_and_mixed_sizes_work(inputs: dict[str, Path],
         "skipped, because 1 of 9 photos missing is not worth starting over: verifying and mapping again with a fisheye "
         "camera model; extracting twice as many features at twice the size",
         "skipped, because the missing photos share too few matches with the others: mapping again from a weaker "
-        "initial pair; mapping again with another seed; mapping again with global mapping",
+        "initial pair; mapping again with another seed and free focal lengths; mapping again with global mapping",
         "1 of 9 photos could not be registered and are left out:",
         "  stranger.png: it shares no view with any other photo",
     ]

@@ -77,7 +77,7 @@ def pixels() -> EvaluationPixels:
 
 def held_out() -> HeldOutEvaluation:
     """The same rays; their patches are too small for SSIM."""
-    photos = HeldOutImages(Images(torch.zeros(2, 3, 4)), torch.eye(2))
+    photos = HeldOutImages(Images(torch.zeros(2, 3, 4), torch.zeros(2, dtype=torch.int64), torch.ones(2)), torch.eye(2))
     patches = EvaluationPatches(pixels(), torch.ones(2, 1, 1, dtype=torch.bool))
     return HeldOutEvaluation(pixels(), patches, photos)
 

@@ -14,6 +14,7 @@ import pytest
 from stages.io.photos import Photo
 from stages.sfm import global_mapping
 from stages.sfm.colmap.diagnosis import compare_models
+from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.mapping import incremental_options, map_incrementally
 from stages.sfm.colmap.repair import (
     agreeing_pairs,
@@ -29,7 +30,7 @@ from stages.sfm.colmap.thinning import thin_matches
 from stages.sfm.matching import consecutive_pairs
 from stages.sfm.retry_strategies import MappingOptions
 
-PHOTOS = 16
+PHOTOS, FOCAL_PX = 16, 1280.0
 
 
 class Made(NamedTuple):
@@ -134,15 +135,88 @@ def test_mapping_of_thinned_matches_finds_the_same_cameras(tmp_path: Path) -> No
     thin_matches(made.database, thinned, tracks=30)
     with pycolmap.Database.open(made.database) as db, pycolmap.Database.open(thinned) as few:
         before, after = db.num_inlier_matches(), few.num_inlier_matches()
-        (guess,), (calibrated,) = db.read_all_cameras(), few.read_all_cameras()
     assert 0 < after < 0.6 * before
-    assert calibrated.has_prior_focal_length and not guess.has_prior_focal_length
-    assert abs(calibrated.mean_focal_length() / 1280 - 1) < 0.1
     options = incremental_options(0, MappingOptions(), camera_is_known=False, thinned=True)
     (model,) = map_incrementally(thinned, tmp_path, tmp_path / "models", options)
     compared = compare_models(made.model, model)
     assert compared["agree"] == PHOTOS and 0 < compared["centre"] < 0.01
     assert check_model(model, made.database, 0).check.passed.all()
+
+
+def test_focal_lengths_are_held_while_mapping_and_then_released(tmp_path: Path) -> None:
+    made = make(tmp_path, points=1000)
+    set_focal_length(made.database, 1.1 * FOCAL_PX, by_exif=True)
+    options = incremental_options(0, MappingOptions(), camera_is_known=False, thinned=True, hold_focal=True)
+    (model,) = map_incrementally(made.database, tmp_path, tmp_path / "models", options)
+    assert model.camera(1).mean_focal_length() == 1.1 * FOCAL_PX and model.num_reg_images() == PHOTOS
+    release_focal_lengths(model)
+    assert abs(model.camera(1).mean_focal_length() / FOCAL_PX - 1) < 0.01
+    assert check_model(model, made.database, 0).check.passed.all()
+
+
+@pytest.mark.parametrize("ratio", [0.5, 0.9, 1.2, 2.0])
+@pytest.mark.parametrize("by_exif", [True, False])
+def test_focal_lengths_are_calibrated_where_exif_is_far_off(tmp_path: Path, ratio: float, by_exif: bool) -> None:
+    made = make(tmp_path)
+    look_apart(made)
+    set_focal_length(made.database, ratio * FOCAL_PX, by_exif=by_exif)
+    assert thin_matches(made.database, tmp_path / "thinned.db") and not list(tmp_path.glob("*calibration*"))
+    found = focal_length(tmp_path / "thinned.db") / FOCAL_PX
+    assert found == ratio if by_exif and 0.8 < ratio < 1.3 else abs(found - 1) < 0.1
+
+
+@pytest.mark.parametrize("by_exif", [True, False])
+def test_photos_whose_axes_meet_calibrate_nothing(tmp_path: Path, by_exif: bool) -> None:
+    made = make(tmp_path)
+    set_focal_length(made.database, 0.5 * FOCAL_PX, by_exif=by_exif)
+    assert not thin_matches(made.database, tmp_path / "thinned.db")
+    assert focal_length(tmp_path / "thinned.db") == 0.5 * FOCAL_PX
+
+
+def test_known_cameras_and_fisheyes_are_not_calibrated(tmp_path: Path) -> None:
+    made = make(tmp_path)
+    look_apart(made)
+    set_focal_length(made.database, 0.5 * FOCAL_PX, by_exif=True)
+    assert not thin_matches(made.database, tmp_path / "known.db", camera_is_known=True)
+    set_focal_length(made.database, 0.5 * FOCAL_PX, by_exif=True, model="OPENCV_FISHEYE")
+    assert not thin_matches(made.database, tmp_path / "fisheye.db")
+    assert focal_length(tmp_path / "known.db") == focal_length(tmp_path / "fisheye.db") == 0.5 * FOCAL_PX
+
+
+def look_apart(made: Made) -> None:
+    """Turn the photos so that their axes do not meet, with the keypoints and matches that they then have."""
+    random = np.random.default_rng(0)
+    for image_id in range(1, PHOTOS + 1):
+        turn(made.model, image_id, random.uniform(-15, 15))
+    with pycolmap.Database.open(made.database) as db, pycolmap.DatabaseTransaction(db):
+        camera, keypoints = made.model.camera(1), {}
+        for image_id in range(1, PHOTOS + 1):
+            image = made.model.image(image_id)
+            seen = [point.point3D_id if point.has_point3D() else None for point in image.points2D]
+            projected = [None if one is None else image.project_point(made.model.point3D(one).xyz) for one in seen]
+            keypoints[image_id] = np.array([(-1.0, -1.0) if one is None else one for one in projected])
+            db.update_keypoints(image_id, np.pad(keypoints[image_id], ((0, 0), (0, 4))))
+        for pair_id, matches in zip(*db.read_all_matches(), strict=True):
+            first, second = pycolmap.pair_id_to_image_pair(pair_id)
+            geometry = pycolmap.estimate_two_view_geometry(
+                camera, keypoints[first], camera, keypoints[second], np.asarray(matches, np.uint32)
+            )
+            db.delete_two_view_geometry(first, second)
+            db.write_two_view_geometry(first, second, geometry)
+
+
+def set_focal_length(database: Path, focal_px: float, by_exif: bool, model: str | None = None) -> None:
+    with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
+        old = db.read_camera(1)
+        name = model or old.model_name
+        camera = pycolmap.Camera.create_from_model_name(1, name, focal_px, old.width, old.height)
+        camera.has_prior_focal_length = by_exif
+        db.update_camera(camera)
+
+
+def focal_length(database: Path) -> float:
+    with pycolmap.Database.open(database) as db:
+        return db.read_camera(1).mean_focal_length()
 
 
 def test_matches_consistent_with_trusted_pairs_are_kept(made: Made, tmp_path: Path) -> None:

@@ -1,0 +1,58 @@
+"""Stage depth: a depth map for every training photo, and a dense point cloud, by stereo alone, without any training.
+
+Pairs of photos → rectified → disparities by semi-global matching → per photo the distances that several neighbours
+agree on → points. Test photos are not looked at, so what is made of the depth maps learns nothing of them.
+"""
+
+from pathlib import Path
+
+from pydantic import Field
+
+from stages.contract import Inputs, Progress, StageConfig, StageResult, Workload
+
+INPUTS = ("ingest", "normalise")
+VERSION = 1
+EXIT_CODE = 20
+RESUMES = True
+ON_REQUEST = True
+PUBLISHED = ("points.ply",)
+NOT_HASHED = ("seconds",)  # it decides the size of the depth maps, and that enters the key
+
+PAIRS_PER_PHOTO = 2.5  # of four neighbours each, most of them chosen by both
+PAIR_SECONDS, PHOTO_SECONDS = 0.35, 0.5  # of a core, at the default size
+
+
+class Config(StageConfig):
+    """Settings of stage depth."""
+
+    downscale: float | None = Field(
+        default=None, ge=1, description="photo width / width of its depth map (default: a longer side of 640 pixels)"
+    )
+    neighbours: int = Field(default=4, ge=2, le=12, description="photos that each photo is matched with")
+    seconds: float | None = Field(
+        default=None, gt=0, description="time limit of the stage: depth maps get smaller (default: none)"
+    )
+
+
+def expected_seconds(config: Config, workload: Workload) -> float:
+    """For pairs and photos at the default size."""
+    if config.seconds is not None:
+        return config.seconds
+    work = workload.photos.number * (PAIRS_PER_PHOTO * config.neighbours / 4 * PAIR_SECONDS + PHOTO_SECONDS)
+    return work / workload.cores + workload.photos.reading_seconds(workload.cores)
+
+
+def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
+    """Choose the size of the depth maps: from ``seconds`` and the speed of this machine where there is a limit."""
+    from stages.depth.planning import choose_downscale
+
+    if config.downscale is not None:
+        return config
+    return config.model_copy(update={"downscale": choose_downscale(config, inputs, progress)})
+
+
+def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
+    """Match pairs of photos, write what they agree on, fuse it into points."""
+    from stages.depth.estimation import estimate_depth
+
+    return estimate_depth(config, inputs, folder, progress)

@@ -1,0 +1,217 @@
+"""The stage's work: pairs are matched, photos get the distances that their neighbours agree on, points are fused.
+
+Every pair leaves a file for each of its photos below ``pairs/``, and every photo its depth map as soon as its pairs are
+there. Both appear whole or not at all, so a run that was killed goes on where it was.
+"""
+
+import shutil
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from nerf.runtime.parallel import in_order, take_over_cores
+from stages.contract import Inputs, Progress, StageError, StageResult, listed
+from stages.depth.consistency import Candidate, DepthMap, agreed
+from stages.depth.files import depth_map_file, read_depth_map, write_depth_map
+from stages.depth.matching import match
+from stages.depth.photos import KEPT_PHOTOS, TrainingPhotos, one_thread_each, read_training_photos
+from stages.depth.point_cloud import ReadMap, fuse, ply_bytes
+from stages.depth.rectification import Rectified
+from stages.io.amounts import short_count
+from stages.io.files import read_tensors, write_durably, write_json
+
+if TYPE_CHECKING:
+    from stages.depth import Config
+
+CPU = torch.device("cpu")
+MATCHING = 0.8  # of the stage's time
+Pairs = Mapping[tuple[int, int], Rectified]
+
+
+def estimate_depth(config: "Config", inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
+    """Write a depth map for each training photo, depth.json and points.ply."""
+    assert config.downscale is not None, "plan() chooses it"
+    take_over_cores()
+    photos = read_training_photos(inputs, config.downscale)
+    pairs, left_out = photos.pairs(config.neighbours)
+    if not pairs:
+        raise _no_pairs(photos, left_out)
+    _say_left_out(photos, pairs, left_out, progress)
+    for name in ("depth", "pairs"):
+        (folder / name).mkdir(exist_ok=True)
+    with one_thread_each():
+        match_pairs(photos, pairs, folder, progress)
+        progress.update("fusing points", MATCHING)
+        read = lru_cache(KEPT_PHOTOS)(lambda number: read_depth_map(depth_map_file(folder, photos.views[number].file)))
+        facts, known = _facts(photos, read, read_tensors(inputs["normalise"] / "points.safetensors"))
+        if not known:
+            raise _nothing_agrees(len(pairs))
+        cloud = fuse(
+            photos, read, known, lambda done: progress.update("fusing points", MATCHING + (1 - MATCHING) * done)
+        )
+    write_durably(folder / "points.ply", ply_bytes(cloud, photos.scene.scene_from_sfm.inverse()))
+    facts |= {"pairs": len(pairs), "pairs_left_out": len(left_out), "points": len(cloud.points)}
+    neighbours = {
+        photos.views[number].name: _names(photos, _neighbours(number, pairs)) for number in range(len(photos.views))
+    }
+    write_json(folder / "depth.json", facts | {"neighbours": neighbours})
+    shutil.rmtree(folder / "pairs")
+    return StageResult(outputs=("depth", "points.ply", "depth.json"), line=_line(photos, facts), facts=facts)
+
+
+# --- pairs
+
+
+def match_pairs(photos: TrainingPhotos, pairs: Pairs, folder: Path, progress: Progress) -> None:
+    """Match what is not there yet, and write the depth map of each photo once all of its pairs are."""
+    waiting = {number: set(_neighbours(number, pairs)) for number in range(len(photos.views))}
+    for number in range(len(photos.views)):
+        if depth_map_file(folder, photos.views[number].file).exists():
+            del waiting[number]
+        elif not waiting[number]:
+            _write_agreed(photos, number, [], folder)
+    to_do = [pair for pair in pairs if waiting.keys() & set(pair)]
+
+    def compute(pair: tuple[int, int]) -> tuple[int, int]:
+        _match(photos, pair, pairs[pair], [number for number in pair if number in waiting_at_first], folder)
+        return pair
+
+    waiting_at_first = frozenset(waiting)
+    for done, pair in enumerate(in_order(compute, to_do, CPU), 1):
+        for number, other in (pair, pair[::-1]):
+            if number in waiting:
+                waiting[number].discard(other)
+                if not waiting[number]:
+                    _write_agreed(photos, number, _neighbours(number, pairs), folder)
+                    del waiting[number]
+        progress.update(f"matched {done} of {len(to_do)} pairs of photos", MATCHING * done / len(to_do))
+
+
+def _neighbours(number: int, pairs: Pairs) -> list[int]:
+    """With which photos one is matched."""
+    return sorted({one for pair in pairs if number in pair for one in pair} - {number})
+
+
+def _match(photos: TrainingPhotos, pair: tuple[int, int], geometry: Rectified, wanted: list[int], folder: Path) -> None:
+    """Write what a pair says of the photos ``wanted`` of it, unless that is there."""
+    missing = [n for n in wanted if not _side_file(folder, n, pair[0] + pair[1] - n).exists()]
+    if not missing:
+        return
+    one, other = pair
+    viewpoints, pixels = [photos.viewpoints[n] for n in pair], [photos.pixels(n) for n in pair]
+    found = match(geometry, (viewpoints[0], viewpoints[1]), (pixels[0], pixels[1]))
+    for number, its_neighbour, side in ((one, other, 0), (other, one, 1)):
+        if number in missing:
+            seen = found.seen_from_right() if side else found
+            write_side(_side_file(folder, number, its_neighbour), seen.of_photo(viewpoints[side], pixels[side].used))
+
+
+def _side_file(folder: Path, number: int, neighbour: int) -> Path:
+    return folder / "pairs" / f"{number:05d}-{neighbour:05d}"
+
+
+def write_side(path: Path, candidate: Candidate) -> None:
+    """What one neighbour says of a photo, whole or not at all."""
+    write_durably(path, np.stack(candidate).astype("<f4").tobytes())
+
+
+def read_side(path: Path, shape: tuple[int, int]) -> Candidate:
+    """The inverse of :func:`write_side`."""
+    return Candidate(*np.frombuffer(path.read_bytes(), "<f4").reshape(3, *shape))
+
+
+def _write_agreed(photos: TrainingPhotos, number: int, neighbours: list[int], folder: Path) -> None:
+    width, height = photos.viewpoints[number].size
+    files = [_side_file(folder, number, one) for one in neighbours]
+    depth = agreed([read_side(file, (height, width)) for file in files], (height, width))
+    write_depth_map(depth_map_file(folder, photos.views[number].file), depth)
+    for file in files:
+        file.unlink()
+
+
+# --- messages
+
+
+def _names(photos: TrainingPhotos, numbers: list[int]) -> list[str]:
+    return [photos.views[number].name for number in numbers]
+
+
+def _no_pairs(photos: TrainingPhotos, left_out: Mapping[tuple[int, int], str]) -> StageError:
+    reasons = sorted(set(left_out.values()))
+    why = f"of those that show the same, {' or '.join(reasons)}" if reasons else "no two show the same from two places"
+    return StageError(
+        "depth.no-pairs",
+        f"no pair of the {len(photos.views)} training photos tells any depth",
+        why,
+        "Take photos from places a few degrees apart, as seen from what they show.",
+    )
+
+
+def _nothing_agrees(pairs: int) -> StageError:
+    return StageError(
+        "depth.nothing-agrees",
+        "no depth is known anywhere",
+        f"of {pairs} pairs of photos no two agree on any point",
+        "Check the cameras, or add photos: each point must be seen by three, and show some texture.",
+    )
+
+
+def _say_left_out(
+    photos: TrainingPhotos, pairs: Pairs, left_out: Mapping[tuple[int, int], str], progress: Progress
+) -> None:
+    if left_out:
+        (one, other), why = next(iter(left_out.items()))
+        first = f"{photos.views[one].name} and {photos.views[other].name}: {why}"
+        progress.note("depth.pairs-left-out", f"{len(left_out)} pairs of photos tell no depth ({first})")
+    alone = [number for number in range(len(photos.views)) if len(_neighbours(number, pairs)) < 2]
+    if alone:
+        which = listed(_names(photos, alone), 3)
+        why = "fewer than two photos show the same from a few degrees beside them"
+        progress.note("depth.photos-alone", f"no depth for {len(alone)} of {len(photos.views)} photos: {why} ({which})")
+
+
+def _facts(photos: TrainingPhotos, read: ReadMap, points: Mapping[str, np.ndarray]) -> tuple[dict[str, Any], int]:
+    """Size, coverage, and how far off the sparse points are, which are measured otherwise; and how many pixels of all
+    depth maps are known."""
+    coverage, sigma, off, known = dict[str, float](), [], [], 0
+    for number, view in enumerate(photos.views):
+        depth = read(number)
+        coverage[view.name] = round(depth.coverage, 4)
+        off.append(disagreement(photos, number, depth, points))
+        sigma.append(float(np.median(depth.sigma[depth.distance > 0])) if depth.coverage else np.nan)
+        known += int(np.count_nonzero(depth.distance))
+    off = np.concatenate(off)
+    facts = {
+        "photos": len(photos.views),
+        "size": list(photos.viewpoints[0].size),
+        "downscale": photos.downscale,
+        "coverage": round(float(np.mean(list(coverage.values()))), 4),
+        "sigma": round(float(np.nanmedian(sigma)), 6) if known else None,
+        "off_sparse": round(float(np.median(off)), 6) if len(off) else None,
+        "coverage_by_photo": coverage,
+    }
+    return facts, known
+
+
+def disagreement(photos: TrainingPhotos, number: int, depth: DepthMap, points: Mapping[str, np.ndarray]) -> np.ndarray:
+    """|distance / that of the sparse point - 1| at each sparse point that a photo sees and whose pixel has a depth."""
+    view, viewpoint = photos.views[number], photos.viewpoints[number]
+    seen = np.flatnonzero(points["view"] == photos.scene.views.index(view))
+    scale = np.array(viewpoint.size) / [viewpoint.camera.width, viewpoint.camera.height]
+    column, row = np.clip((points["xy"][seen] * scale).astype(int), 0, np.array(viewpoint.size) - 1).T
+    true = np.linalg.norm(points["xyz"][points["point"][seen]] - viewpoint.scene_from_camera[:, 3], axis=1)
+    found = depth.distance[row, column]
+    return np.abs(found / np.maximum(true, 1e-30) - 1)[found > 0]
+
+
+def _line(photos: TrainingPhotos, facts: Mapping[str, Any]) -> str:
+    width, height = facts["size"]
+    off = f", {facts['off_sparse']:.1%} off the sparse points" if facts["off_sparse"] is not None else ""
+    return (
+        f"{facts['photos']} photos {width}×{height}, depth at {facts['coverage']:.0%} of the pixels{off} · "
+        f"{short_count(facts['points'])} points"
+    )

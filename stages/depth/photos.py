@@ -1,0 +1,119 @@
+"""The training photos of a scene as depth maps are made of them: viewpoints, pixels, and which pairs are matched."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from nerf.geometry.scene import Scene, View
+from stages.contract import Inputs, StageError
+from stages.depth.matching import even_contrast
+from stages.depth.neighbours import Tracks, choose_pairs, depth_range, tracks_of
+from stages.depth.rectification import CannotRectify, Pixels, Rectified, Viewpoint, rectify
+from stages.io.files import read_scene, read_tensors
+from stages.io.pixels import OPAQUE_FROM, load_mask, load_pixels
+from stages.sfm.colmap.cameras import camera_rays
+
+MAX_DISPARITIES = 512  # of a pair: a surface closer than that is not found by it
+KEPT_PHOTOS = 48  # in memory, decoded: neighbours mostly follow each other
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """OpenCV's own threads are off: pairs and photos are given to the cores instead."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+@dataclass(frozen=True)
+class TrainingPhotos:
+    """The training photos of a scene at 1/``downscale`` of their size, by their number among themselves."""
+
+    ingest: Path
+    scene: Scene
+    tracks: Tracks
+    downscale: float
+
+    @cached_property
+    def views(self) -> tuple[View, ...]:
+        return self.scene.of_split("train")
+
+    @cached_property
+    def poses(self) -> Float[np.ndarray, "n 3 4"]:
+        return np.stack([view.scene_from_camera for view in self.views])
+
+    @cached_property
+    def viewpoints(self) -> list[Viewpoint]:
+        """From where each photo was taken; those of one camera share their rays."""
+        rays = {index: self._rays(index) for index in {view.camera for view in self.views}}
+        return [Viewpoint(self.scene.cameras[v.camera], v.scene_from_camera, rays[v.camera]) for v in self.views]
+
+    def _rays(self, index: int) -> Float[np.ndarray, "h w 3"]:
+        camera = self.scene.cameras[index]
+        width, height = (max(1, int(side / self.downscale + 0.5)) for side in (camera.width, camera.height))
+        return camera_rays(camera, width, height)
+
+    @cached_property
+    def _cached(self) -> Callable[[int], Pixels]:
+        return lru_cache(KEPT_PHOTOS)(self._load)
+
+    def pixels(self, number: int) -> Pixels:
+        """Grey pixels of even contrast, and what masks and transparency leave of them."""
+        return self._cached(number)
+
+    def _load(self, number: int) -> Pixels:
+        view, (width, height) = self.views[number], self.viewpoints[number].size
+        pixels = load_pixels(self.ingest / view.file, width, height)
+        used = np.ones((height, width), bool)
+        if self.scene.has_alpha and pixels.shape[2] == 4:
+            used &= pixels[..., 3] >= OPAQUE_FROM
+        if view.mask is not None:
+            used &= load_mask(self.ingest / view.mask, width, height)
+        grey = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY)
+        return Pixels(even_contrast(grey), used)
+
+    def colours(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
+        """The photo itself, sRGB."""
+        width, height = self.viewpoints[number].size
+        return np.ascontiguousarray(load_pixels(self.ingest / self.views[number].file, width, height)[..., :3])
+
+    def rectified(self, one: int, other: int) -> Rectified:
+        """The rectified pair. Raises CannotRectify."""
+        depths = depth_range(self.poses, self.tracks, (one, other), self.views)
+        return rectify(self.viewpoints[one], self.viewpoints[other], depths, MAX_DISPARITIES)
+
+    def pairs(self, neighbours: int) -> tuple[dict[tuple[int, int], Rectified], dict[tuple[int, int], str]]:
+        """The pairs to be matched, and those left out with the reason."""
+        found, left_out = dict[tuple[int, int], Rectified](), dict[tuple[int, int], str]()
+
+        def usable(one: int, other: int) -> bool:
+            pair = (one, other)
+            try:
+                if pair not in found and pair not in left_out:
+                    found[pair] = self.rectified(*pair)
+            except CannotRectify as why:
+                left_out[pair] = str(why)
+            return pair in found
+
+        return {pair: found[pair] for pair in choose_pairs(self.poses, self.tracks, neighbours, usable)}, left_out
+
+
+def read_training_photos(inputs: Inputs, downscale: float) -> TrainingPhotos:
+    """The training photos of a scene. Raises StageError where a pose is not finite."""
+    scene = read_scene(inputs["normalise"])
+    views = scene.indices_of("train")
+    for index in views:
+        if not np.isfinite(scene.views[index].scene_from_camera).all():
+            what = f"the pose of {scene.views[index].name} is not finite"
+            raise StageError("depth.pose-not-finite", what, "scene.json holds NaN or infinity", "Run normalise again.")
+    tracks = tracks_of(scene, views, read_tensors(inputs["normalise"] / "points.safetensors"))
+    return TrainingPhotos(inputs["ingest"], scene, tracks, downscale)

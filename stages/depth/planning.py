@@ -1,0 +1,47 @@
+"""How large depth maps may be in the time there is."""
+
+import time
+from typing import TYPE_CHECKING
+
+from stages.contract import Inputs, Progress
+from stages.depth.matching import match
+from stages.depth.photos import TrainingPhotos, one_thread_each, read_training_photos
+from stages.hardware.device import processors
+from stages.io.files import read_scene
+
+if TYPE_CHECKING:
+    from stages.depth import Config
+
+DEFAULT_SIDE, MIN_SIDE, TIMED_SIDE = 640, 160, 240  # pixels of the longer side
+TIMED_PAIRS = 2
+COST_EXPONENT = 2.6  # of a pair's seconds by its side: pixels and disparities grow with it, what is fixed does not
+MATCHING_SHARE = 0.6  # of the time; the rest is for photos, for what neighbours agree on and for points
+
+
+def choose_downscale(config: "Config", inputs: Inputs, progress: Progress) -> float:
+    """Photo size over the size of its depth map: DEFAULT_SIDE, or as much of it as fits into ``config.seconds``."""
+    scene = read_scene(inputs["normalise"])
+    longest = max(max(scene.cameras[view.camera].width, scene.cameras[view.camera].height) for view in scene.views)
+    side = float(DEFAULT_SIDE)
+    if config.seconds is not None:
+        progress.update("timing pairs of photos")
+        timed = read_training_photos(inputs, max(1.0, longest / TIMED_SIDE))
+        pairs, seconds = _timed(timed, config.neighbours)
+        if seconds > 0:
+            allowed = MATCHING_SHARE * config.seconds * processors() / pairs
+            side = min(side, max(MIN_SIDE, min(longest, TIMED_SIDE) * (allowed / seconds) ** (1 / COST_EXPONENT)))
+    return round(max(1.0, longest / side), 3)
+
+
+def _timed(photos: TrainingPhotos, neighbours: int) -> tuple[int, float]:
+    """How many pairs there are, and seconds that one takes; 0 where there is none."""
+    pairs, _ = photos.pairs(neighbours)
+    timed = list(pairs.items())[:: max(1, len(pairs) // TIMED_PAIRS)][:TIMED_PAIRS]
+    with one_thread_each():
+        started = time.perf_counter()
+        for (one, other), pair in timed:
+            both = photos.viewpoints[one], photos.viewpoints[other]
+            found = match(pair, both, (photos.pixels(one), photos.pixels(other)))
+            found.of_photo(both[0], photos.pixels(one).used)
+            found.seen_from_right().of_photo(both[1], photos.pixels(other).used)
+        return len(pairs), (time.perf_counter() - started) / max(len(timed), 1)

@@ -1,0 +1,89 @@
+"""Depth maps of walls against the truth."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stages.depth import Config, run
+from stages.depth.consistency import DepthMap
+from stages.depth.files import depth_map_file, read_depth_map
+from tests.conftest import SilentProgress
+from tests.stages.depth.walls import FISHEYE, WallScene, cameras_before, wall
+
+BOX = ((0.1, -0.3, 0), (0.35, 0.3), 10.0, "strong", 2)
+
+
+def back(texture: str = "strong", turn_deg: float = 0.0):
+    return wall((0, 1.0, 0), (3, 2), turn_deg, texture, seed=1)
+
+
+def depth_maps(scene: WallScene, folder: Path, **options) -> list[DepthMap]:
+    """What the stage makes of a scene, at the photos' own size."""
+    inputs, out = scene.write(folder), folder / "depth"
+    out.mkdir()
+    run(Config(downscale=1.0, **options), inputs, out, SilentProgress())
+    return [read_depth_map(depth_map_file(out, f"images/{index:03d}.png")) for index in range(len(scene.poses))]
+
+
+def errors(scene: WallScene, maps: list[DepthMap]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Share of the walls' pixels with a depth, its relative errors, and these over their standard deviations."""
+    covered, error, over_sigma = [], [], []
+    for view, depth in enumerate(maps):
+        true = scene.distances(view, *depth.distance.shape[::-1])
+        wall_, known = np.isfinite(true), depth.distance > 0
+        covered.append((known & wall_).sum() / wall_.sum())
+        error.append((depth.distance / true - 1)[known & wall_])
+        over_sigma.append(error[-1] / depth.sigma[known & wall_])
+    return float(np.mean(covered)), np.concatenate(error), np.concatenate(over_sigma)
+
+
+SCENES = {
+    "slanted": WallScene([back(turn_deg=35)], cameras_before()),
+    "something in front": WallScene([back(), wall(*BOX)], cameras_before()),
+    "repeated": WallScene([back("repeated")], cameras_before()),
+    "rolled, exposed differently": WallScene(
+        [back(turn_deg=20)], cameras_before(roll_deg=25), gains=[1, 0.7, 1.2, 0.8, 1.1, 0.6]
+    ),
+    "fisheye": WallScene([back(turn_deg=10)], cameras_before(), camera=FISHEYE),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_textured_walls_are_where_they_are(name: str, tmp_path: Path) -> None:
+    scene = SCENES[name]
+    covered, error, over_sigma = errors(scene, depth_maps(scene, tmp_path))
+    assert 0.7 < covered <= 1
+    assert 0 < np.median(np.abs(error)) < 0.003
+    assert np.abs(np.median(error)) < 0.0005, "no bias"
+    assert np.mean(np.abs(error) > 0.03) < 0.01
+    assert 0.3 < np.median(np.abs(over_sigma)) < 1.2, "the standard deviation is one (0.67 for a normal law)"
+
+
+def test_a_bare_wall_has_no_depth(tmp_path: Path) -> None:
+    scene = WallScene([back("none"), wall(*BOX)], cameras_before())
+    maps = depth_maps(scene, tmp_path)
+    covered, _, _ = errors(scene, maps)
+    bare = np.concatenate([scene.distances(i, 240, 180)[m.distance > 0] for i, m in enumerate(maps)]) > 3
+    assert 0.05 < covered < 0.2, "the box alone takes a tenth of the photos"
+    assert bare.mean() < 0.2, "and hardly reaches beyond its outline"
+
+
+def test_weak_texture_says_how_uncertain_it_is(tmp_path: Path) -> None:
+    scene = WallScene([back("weak")], cameras_before())
+    strong, weak = (
+        errors(one, depth_maps(one, tmp_path / name))
+        for name, one in (("s", WallScene([back()], cameras_before())), ("w", scene))
+    )
+    assert 0.3 < weak[0] < strong[0]
+    assert 2 < np.median(np.abs(weak[1])) / np.median(np.abs(strong[1])) < 20
+    assert np.median(np.abs(weak[2])) < 1.5
+
+
+def test_masked_pixels_have_no_depth(tmp_path: Path) -> None:
+    mask = np.full((180, 240), 255, np.uint8)
+    mask[:, :100] = 0
+    maps = depth_maps(WallScene([back()], cameras_before(), mask=mask), tmp_path)
+    shares = np.array([[(m.distance[:, :100] > 0).mean(), (m.distance[:, 100:] > 0).mean()] for m in maps])
+    assert shares[:, 0].max() == 0
+    assert 0.3 < shares[:, 1].mean() < 1
