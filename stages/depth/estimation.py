@@ -1,7 +1,7 @@
 """The stage's work: pairs are matched, photos get the distances that their neighbours agree on, points are fused.
 
 Every pair leaves a file for each of its photos below ``pairs/``, and every photo its depth map as soon as its pairs are
-there. Both appear whole or not at all, so a run that was killed goes on where it was.
+there. Both appear whole or not at all, so a run that was killed continues where it was.
 """
 
 import shutil
@@ -13,14 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from nerf.runtime.parallel import in_order, take_over_cores
+from nerf.runtime.parallel import in_order, take_over_cores, workers
 from stages.contract import Inputs, Progress, StageError, StageResult, listed
 from stages.depth.consistency import Candidate, DepthMap, agreed
 from stages.depth.files import depth_map_file, read_depth_map, write_depth_map
-from stages.depth.matching import match
+from stages.depth.matching import MAX_VOLUME_BYTES, cost_volume_bytes, match
 from stages.depth.photos import KEPT_PHOTOS, TrainingPhotos, one_thread_each, read_training_photos
 from stages.depth.point_cloud import ReadMap, fuse, ply_bytes
 from stages.depth.rectification import Rectified
+from stages.hardware.memory import check_memory
 from stages.io.amounts import short_count
 from stages.io.files import read_tensors, write_durably, write_json
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 CPU = torch.device("cpu")
 MATCHING = 0.8  # of the stage's time
+BYTES_PER_PIXEL = 200  # of a rectified pair: directions, coordinates, windows of the refinement
 Pairs = Mapping[tuple[int, int], Rectified]
 
 
@@ -41,6 +43,7 @@ def estimate_depth(config: "Config", inputs: Inputs, folder: Path, progress: Pro
     if not pairs:
         raise _no_pairs(photos, left_out)
     _say_left_out(photos, pairs, left_out, progress)
+    _check_memory(pairs)
     for name in ("depth", "pairs"):
         (folder / name).mkdir(exist_ok=True)
     with one_thread_each():
@@ -136,6 +139,16 @@ def _write_agreed(photos: TrainingPhotos, number: int, neighbours: list[int], fo
 # --- messages
 
 
+def _check_memory(pairs: Pairs) -> None:
+    """Raises StageError where as many pairs as there are cores do not fit into memory."""
+    sizes = [
+        BYTES_PER_PIXEL * (pair.width + pair.disparities) * pair.height + min(cost_volume_bytes(pair), MAX_VOLUME_BYTES)
+        for pair in pairs.values()
+    ]
+    why = "matching a pair of photos on each core at this size takes"
+    check_memory(workers() * max(sizes), "the depth maps", why, "Give a larger --depth.downscale.")
+
+
 def _names(photos: TrainingPhotos, numbers: list[int]) -> list[str]:
     return [photos.views[number].name for number in numbers]
 
@@ -199,8 +212,8 @@ def _facts(photos: TrainingPhotos, read: ReadMap, points: Mapping[str, np.ndarra
 
 def disagreement(photos: TrainingPhotos, number: int, depth: DepthMap, points: Mapping[str, np.ndarray]) -> np.ndarray:
     """|distance / that of the sparse point - 1| at each sparse point that a photo sees and whose pixel has a depth."""
-    view, viewpoint = photos.views[number], photos.viewpoints[number]
-    seen = np.flatnonzero(points["view"] == photos.scene.views.index(view))
+    viewpoint = photos.viewpoints[number]
+    seen = np.flatnonzero(points["view"] == photos.scene.indices_of("train")[number])
     scale = np.array(viewpoint.size) / [viewpoint.camera.width, viewpoint.camera.height]
     column, row = np.clip((points["xy"][seen] * scale).astype(int), 0, np.array(viewpoint.size) - 1).T
     true = np.linalg.norm(points["xyz"][points["point"][seen]] - viewpoint.scene_from_camera[:, 3], axis=1)

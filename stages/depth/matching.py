@@ -18,6 +18,8 @@ from stages.depth.rectification import Pixels, Rectified, Viewpoint, coordinates
 
 BLOCK = 5  # pixels along each side of what is compared at a disparity
 SMALL_STEP, LARGE_STEP = 8 * BLOCK**2, 40 * BLOCK**2  # costs of disparities that change by one, by more
+BYTES_PER_COST = 4
+MAX_VOLUME_BYTES = 1 << 29  # a pair of larger images is matched over the five directions that need a few rows at a time
 PREFILTER_CAP = 63
 UNIQUENESS_PERCENT = 5  # by which the best cost must beat all but its neighbours: repeated patterns do not
 SPECKLE_PIXELS, SPECKLE_RANGE = 30, 1  # smaller patches that differ by more from what is around them are left out
@@ -37,7 +39,7 @@ UNKNOWN = (float("nan"),)
 MAX_SLOPE = 1.0  # pixels of disparity from one pixel to the next: beyond it there is an edge
 
 
-def even_contrast(pixels: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+def even_contrast(pixels: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     """Grey values over their mean and deviation nearby: exposure and vignetting, which differ between photos, go."""
     window = (CONTRAST_WINDOW, CONTRAST_WINDOW)
     grey = pixels.astype(np.float32)
@@ -45,6 +47,11 @@ def even_contrast(pixels: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     variance = np.maximum(cv2.blur(grey * grey, window, borderType=cv2.BORDER_REFLECT) - mean * mean, 0)
     even = (grey - mean) / np.sqrt(variance + CONTRAST_NOISE**2)
     return np.clip(np.rint(128 + CONTRAST_SCALE * even), 0, 255).astype(np.uint8)
+
+
+def cost_volume_bytes(pair: Rectified) -> int:
+    """Memory that the costs of all disparities take at once, which matching over eight directions needs."""
+    return BYTES_PER_COST * pair.width * pair.height * pair.disparities
 
 
 class Disparities:
@@ -77,8 +84,7 @@ class Disparities:
         origin = np.rint(at + value[row, at] - pair.disparities - pair.min_disparity).astype(int)
         sigma[row, at] = self.sigma[row, np.clip(origin, 0, pair.width - 1)]
         value[~np.isfinite(sigma)] = np.nan
-        shifted = pair.shifted_right()
-        return Disparities(shifted, value, sigma)
+        return Disparities(pair.shifted_right(), value, sigma)
 
     def of_photo(self, photo: Viewpoint, used: Bool[np.ndarray, "h w"]) -> Candidate:
         """What the pair says of the pixels of its left photo."""
@@ -109,7 +115,7 @@ def match(pair: Rectified, photos: tuple[Viewpoint, Viewpoint], pixels: tuple[Pi
         uniquenessRatio=UNIQUENESS_PERCENT,
         speckleWindowSize=SPECKLE_PIXELS,
         speckleRange=SPECKLE_RANGE,
-        mode=cv2.STEREO_SGBM_MODE_HH,
+        mode=cv2.STEREO_SGBM_MODE_HH if cost_volume_bytes(pair) <= MAX_VOLUME_BYTES else cv2.STEREO_SGBM_MODE_SGBM,
     )
     found = matcher.compute(left.grey, right.grey).astype(np.float32) / 16
     found[(found < 0) | ~left.used] = np.nan

@@ -138,7 +138,7 @@ def depth_range(
     of the points that either sees, with room for what carries none; by near and far where there are few points."""
     seen = np.unique(tracks.point[np.isin(tracks.view, pair)])
     axis = poses[list(pair), :, 2].sum(axis=0)
-    axis = axis / np.linalg.norm(axis)
+    axis = axis / max(float(np.linalg.norm(axis)), 1e-12)
     depths = (tracks.points[seen] - poses[list(pair), :, 3].mean(axis=0)) @ axis
     depths = depths[depths > 0]
     if len(depths) < FEW_POINTS:

@@ -13,7 +13,7 @@ import pytest
 from nerf.runtime import parallel
 from stages import depth
 from stages.contract import Inputs, Photos, StageResult, Workload, plan_stage
-from stages.depth import Config, estimation, files
+from stages.depth import Config, estimation, files, matching
 from stages.depth.files import depth_map_file, read_depth_map
 from tests.conftest import SilentProgress
 from tests.refusals import refused
@@ -123,7 +123,7 @@ def test_a_full_disk_is_said_and_the_stage_goes_on(last: str, inputs, undisturbe
             patched.setattr(module, "write_durably", write)
         with pytest.raises(OSError, match="No space left"):
             result_of(inputs, tmp_path)
-    assert {k: v for k, v in result_of(inputs, tmp_path)[1].items() if not k.endswith(".tmp")} == undisturbed[1]
+    assert result_of(inputs, tmp_path)[1] == undisturbed[1]
 
 
 def test_a_missing_photo_is_named(inputs, tmp_path) -> None:
@@ -172,6 +172,19 @@ def test_imported_cameras_without_points_do(tmp_path) -> None:
     result, _ = result_of(inputs, tmp_path / "out")
     assert result.facts["off_sparse"] is None
     assert 0.6 < result.facts["coverage"] < 1
+
+
+def test_too_little_memory_is_said_beforehand(inputs, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(estimation, "BYTES_PER_PIXEL", 10**9)
+    with refused("hardware.not-enough-memory", "--depth.downscale"):
+        result_of(inputs, tmp_path)
+
+
+def test_large_pairs_are_matched_in_little_memory(inputs, undisturbed, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(matching, "MAX_VOLUME_BYTES", 0)
+    coverage = result_of(inputs, tmp_path)[0].facts["coverage"]
+    assert coverage == pytest.approx(undisturbed[0].facts["coverage"], abs=0.1)
+    assert coverage != undisturbed[0].facts["coverage"]
 
 
 def test_a_short_time_makes_smaller_maps(inputs, tmp_path) -> None:
