@@ -7,10 +7,12 @@ from contextlib import redirect_stderr, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from types import NoneType
+from typing import Annotated, Any, TypeVar, Union, get_args
 
 import tyro
 from pydantic import ValidationError
+from tyro.constructors import PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from pipeline.cli.options import UsageError, wrong_options
 from pipeline.engine.settings import Settings
@@ -117,7 +119,7 @@ class ResumeArguments:
 
 @dataclass
 class StatusArguments:
-    """Show the state of each stage (cached, stale, partial, never) and its result in one line."""
+    """Show the state of each stage (cached, stale, partial, failed, never) and its result in one line."""
 
     workspace: tyro.conf.Positional[Path]
     json: bool = False
@@ -176,6 +178,37 @@ COMMANDS: dict[str, type] = {
 }
 
 
+TYPES = tyro.constructors.ConstructorRegistry()
+
+
+@TYPES.primitive_rule
+def _chosen_or_given(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """An option that is chosen where it is None shows what may be given. "None" is read, too: it leaves the choice open
+    again."""
+    types = get_args(info.type)
+    if NoneType not in types:
+        return None
+    given: Any = Union[tuple(one for one in types if one is not NoneType)]  # noqa: UP007 -- of a list of types
+    spec = tyro.constructors.ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(given, info.markers))
+    if not isinstance(spec, PrimitiveConstructorSpec):
+        return None
+
+    def read(words: list[str]) -> Any:
+        if words == ["None"]:
+            return None
+        if spec.choices and words[0] not in spec.choices:
+            raise ValueError(f"{words[0]!r} is none of {', '.join(spec.choices)}")
+        return spec.instance_from_str(words)
+
+    return PrimitiveConstructorSpec(
+        nargs=spec.nargs,
+        metavar=spec.metavar,
+        instance_from_str=read,
+        is_instance=lambda value: value is None or spec.is_instance(value),
+        str_from_instance=lambda value: ["None"] if value is None else spec.str_from_instance(value),
+    )
+
+
 def parse(kind: type[T], command: str, words: Sequence[str]) -> T:
     """Parse ``words``; options of stages that they do not name have their defaults.
 
@@ -186,7 +219,7 @@ def parse(kind: type[T], command: str, words: Sequence[str]) -> T:
     said = io.StringIO()
     try:
         with redirect_stderr(said):
-            return tyro.cli(kind, prog=f"pipeline {command}", args=list(words), default=default)
+            return tyro.cli(kind, prog=f"pipeline {command}", args=list(words), default=default, registry=TYPES)
     except SystemExit as ending:
         if ending.code in (None, 0):
             raise
@@ -230,7 +263,7 @@ def _named_options(stage: str, words: Sequence[str]) -> Iterator[str]:
 def _surplus_file(kind: type, words: Sequence[str], default: Any) -> str | None:
     """The first word that is none of the options but an existing file, as a shell gives them for ``*.jpg``."""
     with suppress(SystemExit), redirect_stderr(io.StringIO()):
-        _, unknown = tyro.cli(kind, args=list(words), default=default, return_unknown_args=True)
+        _, unknown = tyro.cli(kind, args=list(words), default=default, return_unknown_args=True, registry=TYPES)
         return next((word for word in unknown if Path(word).is_file()), None)
 
 
@@ -268,7 +301,9 @@ def _what_is_wrong(ending: SystemExit, box: str) -> str:
     for end in ("Got errors:", "Argument helptext:", "For full helptext"):
         words = words.split(end)[0]
     words, _, similar = words.partition("Perhaps you meant:")
-    words = re.sub(r"no type matching (.+) could be instantiated from \[(.*)\]", r"\2 does not fit \1", words)
+    words = re.sub(r"invalid literal for int\(\) with base 10: ('.*')", r"\1 is not a whole number", words)
+    words = re.sub(r"Could not find valid parse for arguments: \[(.*)\]", r"\1 cannot be read", words)
+    words = re.sub(r"could not convert string to float: ('.*')", r"\1 is not a number", words)
     words = " ".join(words.split()).removeprefix("Error parsing ").rstrip(".")
     return words + (f"; perhaps {', '.join(re.findall(r'--[a-z0-9.-]+', similar))}" if similar else "")
 

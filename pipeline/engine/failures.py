@@ -1,9 +1,14 @@
 """What ends a stage, as something a user can act on."""
 
+import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 from stages.contract import StageError
+from stages.io.files import read_json, write_durably
+
+FAILURE = "failure.json"  # in a partial folder: what ended the last attempt at the stage
 
 
 class StageFailed(Exception):
@@ -43,3 +48,24 @@ def _disk_error(error: OSError) -> StageError:
     what = f"cannot read or write {error.filename}" if error.filename else "a file could not be read or written"
     hint = "Free disk space or check permissions, then run again: finished stages are kept."
     return StageError("pipeline.disk", what, error.strerror or str(error), hint)
+
+
+@contextmanager
+def recorded(partial: Path) -> Iterator[None]:
+    """What a stage fails of is written into its partial folder, for ``status``; that of an earlier attempt goes."""
+    file = partial / FAILURE
+    file.unlink(missing_ok=True)
+    try:
+        yield
+    except StageError as error:
+        with suppress(OSError):  # the failure itself matters more
+            write_durably(file, json.dumps({"code": error.code, "what": error.what}).encode())
+        raise
+
+
+def last_failure(partial: Path) -> str | None:
+    """What the last attempt at a stage failed of; None where it was interrupted."""
+    try:
+        return str(read_json(partial / FAILURE)["what"])
+    except (StageError, KeyError, TypeError):
+        return None

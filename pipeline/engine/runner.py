@@ -10,7 +10,7 @@ from typing import Any
 
 from pipeline.engine import machine, manifests, run_file
 from pipeline.engine.display import Display
-from pipeline.engine.failures import StageFailed, worded
+from pipeline.engine.failures import StageFailed, recorded, worded
 from pipeline.engine.job import DamagedInputs, Job, NotReady
 from pipeline.engine.keys import ContentIndex, config_for_key, digest, stage_key
 from pipeline.engine.manifests import BadManifest, Manifest
@@ -409,7 +409,7 @@ class Runner:
         self.workspace.write_run(self.run_file)
         started = datetime.now(UTC)
         self.running = job.stage
-        with counting(self.workspace.root / RUNNING), counting(partial / ATTEMPTS) as spent:
+        with recorded(partial), counting(self.workspace.root / RUNNING), counting(partial / ATTEMPTS) as spent:
             result = job.module.run(job.config, job.folders, partial, self.display)
         outputs = manifests.describe_outputs(partial, result.outputs)
         manifest = Manifest(

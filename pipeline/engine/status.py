@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline.engine import manifests
+from pipeline.engine.failures import last_failure
 from pipeline.engine.job import Job, NotReady
 from pipeline.engine.manifests import BadManifest, Manifest
 from pipeline.engine.runner import Runner
@@ -15,7 +16,7 @@ from stages.contract import KEY_LENGTH, Options, StageError, declared
 
 @dataclass(frozen=True)
 class StageStatus:
-    """``state``: cached / stale / damaged / partial / never; ``text``: its summary or the reason."""
+    """``state``: cached / stale / damaged / partial / failed / never; ``text``: its summary or the reason."""
 
     stage: str
     state: str
@@ -62,6 +63,8 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
     if workspace.partial(stage, job.key).exists():
         if process := workspace.running():
             return StageStatus(stage, "partial", f"process {process} is running in this workspace")
+        if failure := last_failure(workspace.partial(stage, job.key)):
+            return StageStatus(stage, "failed", f"{failure}; `{command}` tries again")
         return StageStatus(stage, "partial", f"interrupted; `{command}` resumes it")
     if last is not None:
         return StageStatus(stage, "stale", "; ".join(differences(job, last)) or "run again")

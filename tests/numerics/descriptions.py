@@ -244,4 +244,10 @@ DESCRIPTIONS = {
         answer="√v is at least 1e-15, not increased by it; 0 stays exactly where it is",
         tried="g over 20 decades; ±0, 1e-45, 1e-38, 1e-30 … 1e18, with and without a past",
     ),
+    "vignetting s(exp(mean p − p(u)) s⁻¹(c))": Description(
+        domain="unit directions; log gains within ±16",
+        hazard="1 − cos θ cancels beside the axis; exp(g) s⁻¹(c) overflows for colours of 1e15",
+        answer="|d − axis|² in its place; from one power law to the other, without linear light in between",
+        tried="angles to the corner, up to 2 EV; the axis, the corner, behind; black to 1e10; 23 stops",
+    ),
 }

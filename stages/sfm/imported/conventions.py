@@ -116,8 +116,6 @@ def _fits(
         turned = poses.copy()
         turned[which] = inverse(poses[which]) if other_direction else poses[which]
         turned[which, :, :3] = turned[which, :, :3] @ turn
-        if np.linalg.det(turn) < 0:
-            turned[which, 2] *= -1  # any mirror will do: they differ by a turn of the world
         yield Fit(other_direction, turn.tolist(), *agreement(matches, turned, among), of=of)
 
 

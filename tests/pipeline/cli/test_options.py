@@ -17,7 +17,7 @@ from stages.render import Config as RenderConfig
 from stages.train import Config as TrainConfig
 from stages.train.fields.hash_grid_options import HashGridOptions
 
-EFFECTS = "background, exposure, pose_refinement, view_dependence"
+EFFECTS = "background, exposure, pose_refinement, vignetting, view_dependence"
 
 
 def over(remembered: Settings, command: str, words: list[str]) -> Settings:

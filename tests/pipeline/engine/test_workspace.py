@@ -5,6 +5,7 @@ import os
 import shutil
 import stat
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,10 +14,12 @@ import pytest
 from PIL import Image
 
 from pipeline.cli.commands import run_command
+from pipeline.engine.failures import recorded
 from pipeline.engine.manifests import Manifest, describe_outputs, outputs_digest
 from pipeline.engine.run_file import RunFile
 from pipeline.engine.status import status_of
 from pipeline.engine.workspace import COPIES, Workspace
+from stages.contract import StageError
 from stages.io.files import make_durable
 from tests.refusals import refused
 
@@ -143,6 +146,20 @@ def test_a_running_stage_is_not_called_interrupted(tmp_path: Path):
         found = status_of(asked, runner, "mesh")
     assert (found.state, found.text) == ("partial", f"process {os.getpid()} is running in this workspace")
     assert status_of(asked, runner, "mesh").text == f"interrupted; `pipeline resume {tmp_path}` resumes it"
+
+
+def test_status_tells_a_failure_from_an_interruption(tmp_path: Path):
+    runner: Any = SimpleNamespace(run_file=RunFile(), resolve=lambda *_, **__: SimpleNamespace(key=KEY))
+    workspace = Workspace(tmp_path)
+    partial = workspace.partial("mesh", KEY)
+    partial.mkdir(parents=True)
+    with pytest.raises(StageError), recorded(partial):
+        raise StageError("mesh.empty", "there is no surface", "the field is empty", "Train longer.")
+    found = status_of(workspace, runner, "mesh")
+    assert (found.state, found.text) == ("failed", f"there is no surface; `pipeline resume {tmp_path}` tries again")
+    with suppress(KeyboardInterrupt), recorded(partial):
+        raise KeyboardInterrupt
+    assert status_of(workspace, runner, "mesh").state == "partial"
 
 
 @pytest.mark.parametrize(

@@ -114,6 +114,8 @@ def test_colours_may_be_written_as_decimals(tmp_path: Path) -> None:
     whole = read_model(written(tmp_path))
     lines = (tmp_path / "points3D.txt").read_text().splitlines()
     decimals = [" ".join(f"{f}.0" if 4 <= i < 7 else f for i, f in enumerate(line.split())) for line in lines]
+    colours = [[int(field) for field in line.split()[4:7]] for line in lines if not line.startswith("#")]
+    np.testing.assert_array_equal(whole.rgb, colours)
     (tmp_path / "points3D.txt").write_text("\n".join(decimals))
     np.testing.assert_array_equal(read_model(tmp_path).rgb, whole.rgb)
 
