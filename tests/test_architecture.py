@@ -41,6 +41,31 @@ LATE = {
     "stages/train/validation_images.py": "kornia takes seconds, and few trainings score whole patches",
     "benchmarks/nerfacto.py": "a part runs in nerfstudio's environment, where ours is not installed",
 }
+# What a test may replace beside the package that it mirrors (tests/stages/mesh: stages/mesh), and libraries.
+BOUNDARIES = {
+    "nerf.runtime.parallel.": "how many threads work",
+    "nerf.kernels.warp": "whether Warp runs here",
+    "nerf.training.hash_grid_trainer.HashGridTrainer.": "a step, at which training is interrupted or spoilt",
+    "stages.hardware.": "the machine",
+    "stages.io.stopwatch.": "time",
+    "stages.render.renderer.": "how fast which field renders",
+    "pipeline.engine.runner.STAGES": "a chain of made-up stages",
+}
+MACHINE = ("time", "cores", "processors", "compute_device", "available_bytes", "available_on")  # wherever imported
+PATCHING = ("setattr", "setitem", "delattr")
+# Sizes that make a test of several packages short, and faults that nothing hands in.
+PATCHED_ELSEWHERE = {
+    "tests/drills/test_divergence.py": ("MIN_HEALTHY_STEPS", "write_profile", "EVALUATION_PIXELS", "UPDATE_INTERVAL"),
+    "tests/nerf/fields/test_hash_grid.py": ("",),  # lengths of marching rounds
+    "tests/nerf/kernels/warp/test_threads.py": ("CHUNK_POINTS",),
+    "tests/pipeline/cli/test_commands.py": ("_photos_digest",),
+    "tests/pipeline/demo/test_demo.py": ("_run_stages", "with_source"),
+    "tests/pipeline/doctor/test_bench.py": ("STREAMED_FLOATS", "MIN_STREAMED_FLOATS"),
+    "tests/stages/evaluate/test_evaluate.py": ("MAX_SCORED_SIDE",),
+    "tests/stages/tradeoff/test_tradeoff.py": ("TILE_SIZE",),
+    "tests/stages/train/test_data.py": ("DECODING_BYTES", "ThreadPoolExecutor"),
+    "tests/stages/train/test_train.py": ("sigma_of",),
+}
 NO_SUBJECT = ("utils.py", "util.py", "helpers.py", "misc.py", "common.py")
 BACKENDS = ("torch", "warp")
 BANNED_CALLS = ("cumprod", "torch.load", "eval")
@@ -282,6 +307,48 @@ def calls_of_plan(module: Module) -> Iterator[str]:
             yield f"{name}()"
 
 
+def origins(tree: ast.AST) -> dict[str, str]:
+    """Where each imported name is from, dotted."""
+    found: dict[str, str] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            found |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Import):
+            found |= {
+                alias.asname or alias.name.split(".")[0]: (alias.asname and alias.name) or alias.name.split(".")[0]
+                for alias in node.names
+            }
+    return found
+
+
+def patched(tree: ast.AST) -> Iterator[str]:
+    """The dotted path of everything imported that monkeypatch replaces. What a test made itself is its own."""
+    names = origins(tree)
+    for node in ast.walk(tree):
+        if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in PATCHING):
+            continue
+        target, root = node.args[0], node.args[0]
+        if isinstance(target, ast.JoinedStr):
+            target = target.values[0]
+        if isinstance(target, ast.Constant) and isinstance(target.value, str):
+            yield target.value
+        while isinstance(root, ast.Attribute | ast.Subscript):
+            root = root.value
+        if isinstance(root, ast.Name) and root.id in names:
+            attribute = node.args[1].value if isinstance(node.args[1], ast.Constant) else "*"
+            yield f"{names[root.id]}{ast.unparse(target).removeprefix(root.id)}.{attribute}"
+
+
+def foreign_patches(module: Module) -> Iterator[str]:
+    """What a test replaces in a package of ours that it does not mirror, and that is no boundary."""
+    mirrored = ".".join(module.name.split("/")[1:-1])
+    for path in patched(module.tree):
+        ours = path.split(".")[0] in PACKAGES
+        tested = mirrored.split(".")[0] in PACKAGES and path.startswith(f"{mirrored}.")
+        if ours and not tested and path.split(".")[-1] not in MACHINE and not path.startswith(tuple(BOUNDARIES)):
+            yield path
+
+
 def long_test_names(module: Module) -> Iterator[str]:
     for function in functions(module.tree):
         if function.name.startswith("test_") and function.name.count("_") > MAX_TEST_NAME_WORDS:
@@ -361,6 +428,12 @@ def test_stages_are_planned_in_one_place():
     )
 
 
+def test_tests_patch_what_they_test():
+    found = {module.name: {path.split(".")[-1] for path in foreign_patches(module)} for module in AROUND}
+    wanted = {name: set(names) for name, names in PATCHED_ELSEWHERE.items()}
+    assert {name: names for name, names in found.items() if names} == wanted
+
+
 def test_names_of_tests_have_few_words():
     assert offenders(long_test_names, AROUND) == []
 
@@ -394,6 +467,11 @@ BROKEN: dict[Rule, list[tuple[str, str]]] = {
     ],
     long_test_names: [("tests/a.py", f"def test{'_a' * (MAX_TEST_NAME_WORDS + 1)}(): 1")],
     calls_of_plan: [("stages/a.py", "plan(config)"), ("benchmarks/a.py", "train.plan(config)")],
+    foreign_patches: [
+        ("tests/stages/mesh/test_a.py", "monkeypatch.setattr('stages.train.loop.MIN_STEPS', 1)"),
+        ("tests/stages/mesh/test_a.py", "from stages.train import loop\npatch.setattr(loop, 'MIN_STEPS', 1)"),
+        ("tests/stages/mesh/test_a.py", "from stages.train.loop import Run\npatch.setattr(Run, 'step', 1)"),
+    ],
     users_of_pycolmap: [("stages/sfm/a.py", "import pycolmap")],
     names_without_a_subject: [("stages/sfm/utils.py", "")],
     long_functions: [("a.py", "def f():\n" + "    x = 1\n" * MAX_FUNCTION_LINES)],

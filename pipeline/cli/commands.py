@@ -93,7 +93,7 @@ def run_command(words: Sequence[str]) -> int:
     except Exception as error:
         if debug:
             traceback.print_exc()
-        what = f"a defect of this program, not of your photos: {type(error).__name__}: {error}"
+        what = f"a bug in this program, not a problem with your photos: {type(error).__name__}: {error}"
         _say("pipeline.defect", what, "this should never happen", REPORT_IT, as_json)
         return exit_codes.DEFECT
 
@@ -298,7 +298,7 @@ def _recorded_settings(workspace: Workspace) -> Settings:
         return settings_from(workspace.read_run().options, "recorded there")
     except UsageError as error:
         why = f"{error}; another version of this program wrote it"
-        hint = f"Give the photos again: pipeline run PHOTOS -o {workspace.root}. What still fits is kept."
+        hint = f"Give the photos again: pipeline run PHOTOS -o {workspace.root}. Results that still match are kept."
         raise StageError(
             "pipeline.recorded-options", f"cannot use the options of {workspace.root}", why, hint
         ) from error

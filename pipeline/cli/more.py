@@ -34,9 +34,9 @@ def with_more(settings: Settings, workspace: Workspace, text: str) -> Settings:
     if after is None:
         raise StageError(
             "pipeline.nothing-to-continue",
-            f"{workspace.root} cannot go on",
+            f"cannot continue the training in {workspace.root}",
             "no training is finished there",
-            f"First: {command}",
+            f"Run this first: {command}",
         )
     return settings.model_copy(update={"train": train.model_copy(update={"after": after, **_budget(text)})})
 
@@ -54,4 +54,6 @@ def _finished(workspace: Workspace, key: str, command: str) -> Manifest | None:
         return workspace.finished("train", key)
     except BadManifest as problem:
         hint = f"It was quarantined; {command} trains again."
-        raise StageError("pipeline.training-damaged", f"{workspace.root} cannot go on", str(problem), hint) from problem
+        raise StageError(
+            "pipeline.training-damaged", f"cannot continue the training in {workspace.root}", str(problem), hint
+        ) from problem

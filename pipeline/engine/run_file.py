@@ -52,7 +52,7 @@ def read(root: Path) -> RunFile:
         reason = first_fault(error)
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         reason = f"it cannot be used ({error})"
-    hint = f"Delete {root / NAME} and give the same `pipeline run` again: finished stages are kept."
+    hint = f"Delete {root / NAME} and repeat the same `pipeline run`: finished stages are kept."
     raise StageError("pipeline.run-file", f"cannot read {root / NAME}", reason, hint)
 
 

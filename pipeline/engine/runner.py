@@ -241,7 +241,7 @@ class Runner:
                     del folders[name]
                     command = command_that_makes(name, self.run_file.stages, self.workspace.root)
                     rebuild = f"`{command} --verify` rebuilds it ({problem})"
-                    self.display.note("pipeline.damaged-input", f"{name} is damaged: left out; {rebuild}")
+                    self.display.note("pipeline.damaged-input", f"{name} is damaged and left out; {rebuild}")
         if damaged:
             raise DamagedInputs
 
@@ -361,7 +361,7 @@ class Runner:
         what_is_left = {stage: None, **to_come}
         main = (how := declared(module, "FLEXIBLE")) is not None and how.max_share >= 1
         if main and (why := self.budget.shortage(STAGES, what_is_left, reading)):
-            self.display.note("pipeline.budget-exceeded", f"the budget cannot be kept: {why}")
+            self.display.note("pipeline.budget-exceeded", f"the budget is too short: {why}")
         return options.model_copy(update={"seconds": self.budget.give(STAGES, stage, to_come, reading)})
 
     def _config_for_key(self, stage: str, config: StageConfig) -> dict[str, Any]:

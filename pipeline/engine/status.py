@@ -114,7 +114,7 @@ def explain(workspace: Workspace, runner: Runner, stage: str) -> list[str]:
         return lines
     last = last_result(workspace, runner, stage)
     if status.state == "cached":
-        lines.append("It would not run: its key has a finished result.")
+        lines.append("It would not run: a finished result has this key.")
     elif last is None:
         lines.append("It would run: it has never finished in this workspace.")
     else:

@@ -76,7 +76,7 @@ class Workspace:
             (self.root / ".lock.pid").write_text(f"{os.getpid()}\n")
         except Timeout:
             why = f"process {self._holder()} holds its lock"
-            hint = "Wait for it to end; `run` and `demo` can be given another one with -o."
+            hint = "Wait for it to end, or give `run` or `demo` another workspace with -o."
             raise StageError("pipeline.workspace-in-use", f"{self.root} is in use", why, hint) from None
         except OSError as error:
             self._lock.release()

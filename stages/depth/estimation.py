@@ -223,7 +223,7 @@ def disagreement(photos: TrainingPhotos, number: int, depth: DepthMap, points: M
 
 def _line(photos: TrainingPhotos, facts: Mapping[str, Any]) -> str:
     width, height = facts["size"]
-    off = f", {facts['off_sparse']:.1%} off the sparse points" if facts["off_sparse"] is not None else ""
+    off = f", {facts['off_sparse']:.2%} off the sparse points" if facts["off_sparse"] is not None else ""
     return (
         f"{facts['photos']} photos {width}×{height}, depth at {facts['coverage']:.0%} of the pixels{off} · "
         f"{short_count(facts['points'])} points"

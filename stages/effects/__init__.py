@@ -109,7 +109,7 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
         count = "none" if not pilots else "one at most"
         progress.note(
             "effects.few-pilots",
-            f"a pilot takes about {duration(took)} here, {duration(config.seconds)} are given: {count}",
+            f"a pilot takes about {duration(took)} here, and {duration(config.seconds)} are available: {count}",
         )
     return config.model_copy(update={"pilots": pilots, "fitting_pilots": min(pilots, int(more))})
 

@@ -153,12 +153,12 @@ class _Study:
         if math.isinf(statistic.noise):
             return Verdict(default, statistic.words)
         if why := self._why_no_pilot(off, on):
-            return Verdict(default, f"{statistic.words}; not clear, and no pilot: {why}")
+            return Verdict(default, f"{statistic.words}; unclear, and no pilot: {why}")
         return self._piloted(effect, off, on)
 
     def _why_no_pilot(self, off: Decisions, on: Decisions) -> str | None:
         if not self.config.pilot_steps:
-            return "none was wanted"
+            return "--effects.pilot-steps 0"
         if self.pilots == self.config.pilots:
             return f"{self.pilots} were made already" if self.pilots else "there is no time for one"
         if fits_poses(off, on) and self.fitting_pilots == self.config.fitting_pilots:
@@ -175,7 +175,7 @@ class _Study:
         try:
             pilot = pilots.run_pilot(self.trial, off, on, self.config.pilot_steps, self.config.seed, self.progress)
         except NonFinite as fault:
-            return Verdict(default, f"{words}; not clear, and the pilot diverged: {fault}")
+            return Verdict(default, f"{words}; unclear, and the pilot diverged: {fault}")
         gain = f"a pilot gained {pilot.gain_db:+.2f} ± {pilot.noise_db:.2f} dB"
         stays = not pilot.hurts if default else pilot.pays
         return Verdict(stays, f"{words}; {gain}", pilot)

@@ -42,7 +42,7 @@ def affordable_fraction(config: "Config", inputs: Inputs, progress: Progress) ->
         progress.note(
             "evaluate.some-pixels",
             f"{short_count(speed)} rays/s here: all pixels of {len(test)} test photos take about {duration(whole)}, "
-            f"{time_budget.message()}; --evaluate.fraction 1 asks for all",
+            f"{time_budget.message()}; --evaluate.fraction 1 scores all",
         )
     return fraction
 

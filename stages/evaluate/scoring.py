@@ -14,7 +14,7 @@ from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from nerf.geometry.scene import Scene, View
 from nerf.training.metrics import mean_squared_error, psnr
-from stages.contract import Inputs, Progress, StageError, StageResult
+from stages.contract import Inputs, Note, Progress, StageError, StageResult
 from stages.effects.image_effects import held_out_words, photo_effects, refines_poses
 from stages.evaluate.baselines import MeanPhoto, mean_photo, nearest_view, resized
 from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
@@ -36,7 +36,7 @@ class Scores(NamedTuple):
     """The figures of each photo as metrics.json has them, and notes on how they came about."""
 
     images: list[dict[str, Any]]
-    notes: list[str]
+    notes: list[Note]
 
 
 # --- load
@@ -81,10 +81,11 @@ def score(scorer: "Scorer", folder: Path, progress: Progress) -> Scores:
         (folder / name).mkdir()
     test = scorer.scene.of_split("test")
     views = [view for view in test if (mask := scorer.mask(view)) is None or mask.any()]
-    notes = []
+    notes = list[Note]()
     if masked := len(test) - len(views):
-        notes.append(f"masks leave nothing to compare of {photos_in_words(masked)} at this size")
-        progress.note("evaluate.masked", notes[-1])
+        what = f"masks leave nothing to compare of {photos_in_words(masked)} at this size"
+        notes.append(Note("evaluate.masked", what))
+        progress.note(*notes[-1])
     if not views:
         return Scores([], notes)
     progress.update("averaging the training photos")

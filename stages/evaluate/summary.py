@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+from stages.contract import Note
 from stages.evaluate.image_metrics import ERROR_SCALE, MIN_FOR_INTERVAL, mean_interval
 from stages.train.data import MAX_SCORED_SIDE
 
@@ -12,28 +13,33 @@ MIN_TRUSTED_WIDTH = 0.5  # of the scores' usual one: below, an image can be shar
 MIN_DIFFERENCE_DB = 0.5  # between two scores of right halves, to be mentioned
 # Why nothing is measured, by whether there are test photos at all.
 UNMEASURED = {False: "no photo was kept for testing", True: "masks leave nothing of the test photos"}
-NO_LPIPS = "LPIPS is not computed: no package in use ships its weights and nothing is downloaded"
+NO_LPIPS = Note(
+    "evaluate.no-lpips", "LPIPS is not computed: no package in use ships its weights and nothing is downloaded"
+)
 
 
-def overall(images: list[dict[str, Any]], test_photos: int, notes: list[str]) -> dict[str, Any]:
+def overall(images: list[dict[str, Any]], test_photos: int, notes: list[Note]) -> dict[str, Any]:
     """The figures over all photos, as metrics.json has them."""
     metrics: dict[str, Any] = {key: _mean([image[key] for image in images]) for key in FIGURES}
     for key in ("psnr", "ssim"):
         values = [image[key] for image in images if image[key] is not None]
         metrics[f"{key}_interval"] = mean_interval(values)
+    more = list[Note]()
     if not images:
-        notes = [*notes, f"{UNMEASURED[test_photos > 0]}, so nothing is measured"]
+        what = f"{UNMEASURED[test_photos > 0]}, so nothing is measured"
+        more.append(Note("evaluate.nothing-measured", what))
     elif len(images) < MIN_FOR_INTERVAL:
-        notes = [*notes, f"no interval: {photos_in_words(len(images))} cannot show how much the figures vary"]
+        what = f"no interval: {photos_in_words(len(images))} cannot show how much the figures vary"
+        more.append(Note("evaluate.no-interval", what))
     if small := sum(image["psnr_right_half"] is None for image in images):
-        what = f"a half of {photos_in_words(small)} has too few pixels to fit an exposure on or to score with it"
-        notes = [*notes, what]
+        what = f"half of {photos_in_words(small)} has too few pixels to fit an exposure or to score it"
+        more.append(Note("evaluate.small-halves", what))
     return metrics | {
         "lpips": None,
         "photos_scored": len(images),
         "photos_test": test_photos,
         "error_scale": [0, ERROR_SCALE],
-        "notes": [*notes, NO_LPIPS],
+        "notes": [note._asdict() for note in (*notes, *more, NO_LPIPS)],
         "images": images,
     }
 
@@ -57,7 +63,7 @@ def verdict(metrics: dict[str, Any]) -> str:
     elif value <= nearest:
         what = f"Worse than showing the nearest photo ({value:.1f} against {nearest:.1f} dB): train longer"
     elif value < 22 or _below(similarity, 0.7):
-        what = f"Better than any photo nearby by {value - nearest:.1f} dB but soft: {figures}"
+        what = f"Better than the nearest training photo by {value - nearest:.1f} dB but soft: {figures}"
     elif value < 27 or _below(similarity, 0.85):
         what = f"Good, with fine detail missing: {figures}, {gain}"
     elif max(metrics["scored_size"]) < MIN_TRUSTED_WIDTH * min(max(metrics["photo_size"]), MAX_SCORED_SIDE):

@@ -150,5 +150,5 @@ def boundary(surface: Surface, box: np.ndarray, voxel: float) -> str:
     if len(border) == 0:
         return "closed, but not a manifold"
     at_box = ((border < box[0] + voxel / 2) | (border > box[1] - voxel / 2)).any(axis=1)
-    places = [("at the edge of the region", at_box.any()), ("where too few photos look", not at_box.all())]
+    places = [("at the edge of the region", at_box.any()), ("where too few photos see it", not at_box.all())]
     return "open " + " and ".join(place for place, present in places if present)

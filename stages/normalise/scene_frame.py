@@ -89,7 +89,7 @@ def _check(config: "Config", views: int) -> None:
         raise StageError(
             "normalise.few-photos",
             f"only {views} photo{'s' * (views != 1)} with a known camera",
-            f"a scene needs at least {MIN_VIEWS}: two to learn from and one to check against",
+            f"a scene needs at least {MIN_VIEWS}: two to train on and one to test on",
             "Add photos that overlap with these.",
         )
     if config.roi and config.roi[3] <= 0:

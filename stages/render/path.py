@@ -149,7 +149,7 @@ def path_from_file(scene: Scene, file: Path) -> CameraPath:
             cameras.append(read_intrinsics(intrinsics_of(frame, content), usual.width, usual.height, focal))
             poses.append(_in_scene(frame["transform_matrix"], scene.scene_from_sfm))
         except (TypeError, ValueError, ArithmeticError) as error:
-            hint = "Give numbers as output/transforms.json and output/path.json have them."
+            hint = "Use the format of output/transforms.json or output/path.json."
             raise StageError(
                 "render.unusable-frame", f"cannot use frame {index} of {file.name}", str(error), hint
             ) from error

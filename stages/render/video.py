@@ -205,7 +205,8 @@ def with_appearance(
         return renderer, description
     if "exposure" not in field["effects"]:
         progress.note(
-            "render.no-exposure", f"the field has no exposure model: all photos, and so {photo}, count as exposed alike"
+            "render.no-exposure",
+            f"the field has no exposure model: all photos, including {photo}, get the same exposure",
         )
         return renderer, description
     view = next((view for view in scene.views if view.name == photo), None)
@@ -219,7 +220,7 @@ def with_appearance(
         return as_photo, f"exposed like {photo}"
     progress.note(
         "render.expected-exposure",
-        f"{photo} is no training photo: its exposure is estimated from the training photos nearest to it",
+        f"{photo} is not a training photo: its exposure is estimated from the training photos nearest to it",
     )
     return as_photo, f"exposed as estimated for {photo}"
 

@@ -262,7 +262,7 @@ def _note_weak_links(photos: Sequence[Photo], links: Sequence[dict[str, Any]], p
     """Name the photos whose poses rest on few matches: nothing else would show it if these were wrong."""
     weak = {file for link in links for file in link["photos"]}
     if who := [photo.name for photo in photos if photo.image_name in weak]:
-        progress.note("sfm.few-matches", f"few matches hold the poses of {listed(who, MAX_NAMES)} beside the others")
+        progress.note("sfm.few-matches", f"few matches link {listed(who, MAX_NAMES)} to the other photos")
 
 
 def _skipped_for_time(strategies: Sequence[dict[str, Any]]) -> str:

@@ -26,8 +26,8 @@ def background_statistic(
     beyond = np.abs(position).max(axis=1) > REGION_HALF_SIZE
     share = float(np.average(beyond, weights=seen))
     words = (
-        f"only alpha could tell that nothing lies beyond the region: {share:.1%} of what is tracked does, and "
-        f"{untracked:.0%} of the photos' area has no track near"
+        f"on unless alpha rules it out: {share:.1%} of the tracked points lie beyond the region of interest, and "
+        f"{untracked:.0%} of the photos' area has no point nearby"
     )
     return Statistic(share, "share", NEVER, NEVER, True, words)
 

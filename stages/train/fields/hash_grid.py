@@ -157,7 +157,7 @@ def rays_per_step(config: Config) -> float:
 
 def work(config: Config, rays: float) -> str:
     """What so many rays take, beside drawing them."""
-    return f" and compute {short_count(rays * SAMPLES_PER_RAY[_space(config)])} colours"
+    return f" and evaluate {short_count(rays * SAMPLES_PER_RAY[_space(config)])} colours"
 
 
 def memory_bytes(config: Config, workers: int) -> float:

@@ -201,7 +201,7 @@ def test_damaged_optional_inputs_are_left_out_in_place(bring: Bring, tmp_path: P
     assert seen == [{"ingest"}] and calls == ["train"]
     assert [p.name for p in folder.parent.iterdir()] == [folder.name], "nobody would make it again"
     (note,) = notes
-    assert note.startswith(f"sfm is damaged: left out; `pipeline sfm {tmp_path / 'w.nerf'} --verify` rebuilds it (")
+    assert note.startswith(f"sfm is damaged and left out; `pipeline sfm {tmp_path / 'w.nerf'} --verify` rebuilds it (")
     bring(stages=("ingest", "sfm", "train"), verify=True, force={"train"})
     assert "sfm" in calls and seen[1:] == [{"ingest", "sfm"}]
 
@@ -362,7 +362,7 @@ def test_status_and_explain_say_what_changed(bring: Bring, tmp_path: Path):
     assert [s.state for s in states] == ["cached", "cached", "stale"]
     assert states[2].text == "train.steps: 3 → 8"
     assert "  train.steps: 3 → 8" in status.explain(workspace, runner, "train")
-    assert "It would not run: its key has a finished result." in status.explain(workspace, runner, "sfm")
+    assert "It would not run: a finished result has this key." in status.explain(workspace, runner, "sfm")
     assert calls[-1:] == ["train"], "looking runs nothing"
 
 

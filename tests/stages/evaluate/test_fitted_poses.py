@@ -82,7 +82,7 @@ def test_a_test_pose_is_fitted_in_viewing_distances(monkeypatch: pytest.MonkeyPa
         asked.append(given[-1])
         return PoseRefinement(torch.zeros(1, 3))
 
-    monkeypatch.setattr("nerf.effects.pose_refinement.fit_pose", fit)
+    monkeypatch.setattr("stages.evaluate.half_images.fit_pose", fit)
     some, whole = torch.rand(8, 40, 3), torch.ones(8, 40)
     rays = Rays(some, some, whole, whole)
     field: Any = None

@@ -26,10 +26,10 @@ METRICS: dict[str, Any] = {"psnr": 28.9, "psnr_interval": (28.5, 29.3), "ssim": 
         (11.2, 0.3, "Unusable: 11.2 dB is no better than the mean of the training photos (12.9 dB); "
          "look at the camera layout, then train longer."),
         (13.1, 0.4, "Worse than showing the nearest photo (13.1 against 14.2 dB): train longer."),
-        (17.3, 0.61, "Better than any photo nearby by 3.1 dB but soft: 17.3 dB on 7 unseen photos at 800 × 600, "
-         "SSIM 0.61."),
-        (25.0, 0.65, "Better than any photo nearby by 10.8 dB but soft: 25.0 dB on 7 unseen photos at 800 × 600, "
-         "SSIM 0.65."),
+        (17.3, 0.61, "Better than the nearest training photo by 3.1 dB but soft: 17.3 dB on 7 unseen photos at "
+         "800 × 600, SSIM 0.61."),
+        (25.0, 0.65, "Better than the nearest training photo by 10.8 dB but soft: 25.0 dB on 7 unseen photos at "
+         "800 × 600, SSIM 0.65."),
         (24.0, 0.8, "Good, with fine detail missing: 24.0 dB on 7 unseen photos at 800 × 600, SSIM 0.80, "
          "9.8 dB better than the nearest photo."),
         (28.9, 0.87, "Sharp and trustworthy: 28.9 dB on 7 unseen photos at 800 × 600, SSIM 0.87, "

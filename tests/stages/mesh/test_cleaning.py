@@ -151,8 +151,8 @@ def sheet(low, high):
     [
         (tetrahedra(0.5), "watertight"),
         (sheet(-0.9, 0.9), "open at the edge of the region"),
-        (sheet(-0.5, 0.5), "open where too few photos look"),
-        (sheet(-0.9, 0.5), "open at the edge of the region and where too few photos look"),
+        (sheet(-0.5, 0.5), "open where too few photos see it"),
+        (sheet(-0.9, 0.5), "open at the edge of the region and where too few photos see it"),
         (tetrahedra(0.5)._replace(faces=np.concatenate([FACES, FACES])), "closed, but not a manifold"),
     ],
 )

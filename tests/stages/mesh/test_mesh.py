@@ -243,7 +243,7 @@ def test_a_plain_ends_at_box_or_photos(run_mesh):
     far = replace(scene_around(), views=tuple(replace(v, far=2.2) for v in scene_around().views))
     near_part, _ = run_mesh(Solid(plain), folder="near", scene=far)
     assert 0 < near_part.facts["surface_area"] < 0.9 * result.facts["surface_area"]
-    assert "where too few photos look" in near_part.line
+    assert "where too few photos see it" in near_part.line
 
 
 def test_flat_scenes_have_smaller_voxels(run_mesh):

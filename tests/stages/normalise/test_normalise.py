@@ -262,7 +262,7 @@ def test_two_photos_are_too_few(inputs, progress) -> None:
     with pytest.raises(StageError) as error:
         run(inputs(2), progress)
     assert str(error.value) == (
-        "only 2 photos with a known camera: a scene needs at least 3: two to learn from and one to check against. "
+        "only 2 photos with a known camera: a scene needs at least 3: two to train on and one to test on. "
         "Add photos that overlap with these."
     )
 

@@ -374,13 +374,13 @@ def test_a_field_without_exposure_says_nothing_of_it(inputs, progress) -> None:
     assert "appearance" not in result.facts and "expos" not in result.line
     progress.notes.clear()
     assert "appearance" not in run(inputs, progress, frames=2, width=40, match_exposure="3.jpg").facts
-    assert progress.notes == ["the field has no exposure model: all photos, and so 3.jpg, count as exposed alike"]
+    assert progress.notes == ["the field has no exposure model: all photos, including 3.jpg, get the same exposure"]
 
 
 @pytest.mark.parametrize(
     ("like", "level", "words", "note"),
     [
-        ("0.jpg", 0.6858, "exposed as estimated for 0.jpg", "0.jpg is no training photo: its exposure is estimated"),
+        ("0.jpg", 0.6858, "exposed as estimated for 0.jpg", "0.jpg is not a training photo: its exposure is estimated"),
         ("81.jpg", 0.5, NEUTRAL, f"there is no registered photo 81.jpg: {NEUTRAL}; did you mean 8.jpg"),
     ],
 )

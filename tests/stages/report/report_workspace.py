@@ -155,7 +155,10 @@ def _write_metrics(folder: Path, scene: Scene, size: tuple[int, int]) -> None:
         "trained_size": [size[0] // 2, size[1] // 2],
         "error_scale": [0, 0.3],
     }
-    words = {"notes": ["LPIPS is not computed"], "verdict": "Better than any photo nearby by 7.3 dB but soft."}
+    words = {
+        "notes": [{"code": "evaluate.no-lpips", "text": "LPIPS is not computed"}],
+        "verdict": "Better than the nearest training photo by 7.3 dB but soft.",
+    }
     write_json(folder / "metrics.json", {"psnr_interval": [21.1, 21.9], "images": images} | overall | counts | words)
 
 

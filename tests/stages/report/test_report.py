@@ -70,7 +70,7 @@ def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path
         "psnr_nearest_view": 14.2,
         "scored_fraction": 0.25,
         "mesh": {"vertices": 105_900, "faces": 211_817, "watertight": False},
-        "verdict": "Better than any photo nearby by 7.3 dB but soft.",
+        "verdict": "Better than the nearest training photo by 7.3 dB but soft.",
         "budget": None,
     }
 
@@ -136,7 +136,7 @@ def test_page_is_the_same_twice_and_gives_no_folder_away(inputs: dict[str, Path]
 def test_page_answers_questions_in_order(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     html, _ = written(inputs, tmp_path / "out", progress)
     story = [
-        "Better than any photo nearby by 7.3 dB but soft.",
+        "Better than the nearest training photo by 7.3 dB but soft.",
         "21.5 <span>dB ± 0.4</span>",
         "<video",
         '<span class="tag">best</span> IMG_0020.jpg',
@@ -277,7 +277,8 @@ def test_without_test_photos_the_page_says_so(tmp_path: Path, progress: Any):
     path = inputs["evaluate"] / "metrics.json"
     metrics = json.loads(path.read_text("utf-8"))
     nothing = dict.fromkeys(("psnr", "ssim", "psnr_interval", "psnr_mean_image", "psnr_nearest_view"))
-    write_json(path, metrics | nothing | {"images": [], "verdict": "Not measured.", "notes": ["no photo was kept"]})
+    note = {"code": "evaluate.nothing-measured", "text": "no photo was kept"}
+    write_json(path, metrics | nothing | {"images": [], "verdict": "Not measured.", "notes": [note]})
     html, _ = written(inputs, tmp_path / "out", progress)
     assert "No photo was kept." in html and "None" not in html
 

@@ -217,9 +217,9 @@ def test_unbounded_space_without_alpha_has_a_background(scene: Scene, space: Spa
 
 
 def test_the_reason_for_sizes_is_the_budget() -> None:
-    said = "100 steps draw about 1.0 M rays and compute 3.0 M colours: sizes left open are chosen for that"
+    said = "100 steps render about 1.0 M rays and evaluate 3.0 M colours: open sizes are chosen for that"
     assert reason(GRID, 1e6) == said
-    assert reason(VANILLA, 950) == "10 s on this machine draw about 950 rays: sizes left open are chosen for that"
+    assert reason(VANILLA, 950) == "10 s on this machine render about 950 rays: open sizes are chosen for that"
 
 
 FOLDED = GRID.model_copy(update={"space": "contracted", "downscale": 1.0})
