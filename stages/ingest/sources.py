@@ -408,7 +408,9 @@ def _colmap_model(folder: Path, photos: Sequence[str]) -> Path:
 
 
 def _what_is_missing(folder: Path) -> str:
-    parts = [path.name for part in ("cameras", "images") for path in folder.glob(f"{part}.*")]
+    names = [f"{part}{ending}" for part in ("cameras", "images") for ending in (".bin", ".txt")]
+    paths = (place / name for place in (folder, *_below(folder, MAX_DEPTH)) for name in names)
+    parts = [path.relative_to(folder).as_posix() for path in paths if path.is_file()]
     here = [path for path in folder.iterdir() if path.is_file()] if folder.is_dir() else []
     if parts:
         return f"it needs cameras and images, both in .bin or in .txt, and there is only {listed(parts, FEW_NAMES)}"

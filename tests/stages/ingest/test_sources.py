@@ -299,6 +299,7 @@ def test_what_is_missing_of_a_colmap_model_is_named(tmp_path: Path) -> None:
     touch(tmp_path, "photos/a.jpg", "db/database.db", "half/sparse/0/cameras.txt", "half/sparse/0/rigs.txt", "m/a.ply")
     assert "database.db holds COLMAP's features" in refusal(tmp_path / "photos", tmp_path / "db").why
     assert "there is only cameras.txt" in refusal(tmp_path / "photos", tmp_path / "half/sparse/0").why
+    assert "there is only sparse/0/cameras.txt" in refusal(tmp_path / "photos", tmp_path / "half").why
     assert refusal(tmp_path / "photos", tmp_path / "m").why.endswith("there is a.ply")
 
 
