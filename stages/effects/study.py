@@ -147,7 +147,9 @@ class _Study:
         if asked is not None:
             return Verdict(asked == "on", f"asked for; {statistic.words}")
         # Highlights have no tracks: what is seen of view dependence is a lower bound, and too little of it no proof.
-        unproven = default and statistic.called_for is False
+        unproven = (default and statistic.called_for is False) or (
+            effect.only_by_pilot and statistic.called_for is True
+        )
         if statistic.called_for is not None and not unproven:
             return Verdict(statistic.called_for, statistic.words)
         if math.isinf(statistic.noise):

@@ -192,7 +192,7 @@ def test_decisions_are_read_as_they_were_written(tmp_path: Path) -> None:
     ("made", "on"),
     [
         (Effects(exposure_ev=1.0), {"background", "exposure", "view_dependence"}),
-        (Effects(vignetting_ev=1.0), {"background", "vignetting", "view_dependence"}),
+        (Effects(vignetting_ev=1.0), {"background", "view_dependence"}),  # clear, but only an A/B run turns it on
         (Effects(highlight=1.0, alpha=True), {"view_dependence"}),
     ],
 )
@@ -204,6 +204,13 @@ def test_real_evidence_of_a_synthetic_scene(tmp_path: Path, made: Effects, on: s
     table = json.loads((folder / "effects.json").read_text("utf-8"))
     found = {name for name, entry in table.items() if entry["on"] and entry["modelled"]}
     assert found == on
+    assert (table["vignetting"]["statistic"] > table["vignetting"]["threshold"]) == bool(made.vignetting_ev)
+
+
+@pytest.mark.parametrize(("gain", "on"), [(0.6, True), (-0.5, False)])
+def test_clear_vignetting_is_left_to_a_pilot(decided: Callable, gain: float, on: bool) -> None:
+    decisions, table, _, tried = decided(effects.Config(), gain, vignetting=found(True))
+    assert tried == ["vignetting"] and ("vignetting" in decisions.on) == table["vignetting"]["on"] == on
 
 
 @pytest.mark.parametrize(("seconds", "pilots_made"), [(0.0, 0), (29.0, 0), (31.0, 1), (95.0, 2)])
