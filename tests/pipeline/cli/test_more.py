@@ -114,7 +114,7 @@ def test_more_of_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert run_command(["run", str(photos), "-o", str(tmp_path / "w"), "--until", "ingest"]) == 0
     assert run_command(["run", str(photos), "-o", str(tmp_path / "w"), "--more", "10m"]) == 3
     said = capsys.readouterr().err
-    assert "no training is finished there" in said and f"First: pipeline train {tmp_path / 'w'}" in said
+    assert "no training is finished there" in said and f"Run this first: pipeline train {tmp_path / 'w'}" in said
 
 
 def test_more_belongs_to_training(trained, capsys: pytest.CaptureFixture[str]):
