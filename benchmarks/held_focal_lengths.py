@@ -14,14 +14,13 @@ import argparse
 import shutil
 import tempfile
 import time
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from benchmarks.record import Record, add_out
-from stages.sfm.colmap.database import Features
+from stages.sfm.colmap.database import verify_again
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.mapping import incremental_options, map_incrementally
 from stages.sfm.colmap.repair import check_model
@@ -94,15 +93,7 @@ def distort(database: Path, copy: Path, distortion: float) -> None:
             square = (offset**2).sum(axis=1, keepdims=True) / focal_length(database) ** 2
             keypoints[:, :2] = centre + offset * (1 + distortion * square)
             db.update_keypoints(image.image_id, keypoints)
-        photo = partial(Features().read, db)
-        for pair_id, matches in zip(*db.read_all_matches(), strict=True):
-            first, second = pycolmap.pair_id_to_image_pair(pair_id)
-            one, other = photo(first - 1), photo(second - 1)
-            geometry = pycolmap.estimate_two_view_geometry(
-                one.camera, one.keypoints, other.camera, other.keypoints, np.asarray(matches, np.uint32)
-            )
-            db.delete_two_view_geometry(first, second)
-            db.write_two_view_geometry(first, second, geometry)
+        verify_again(db, seed=0)
 
 
 def focal_length(database: Path) -> float:

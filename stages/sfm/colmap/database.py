@@ -317,7 +317,7 @@ def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:
     """
     if copy.exists():
         return
-    unfinished, options = unfinished_copy(database, copy), _verification(seed)
+    unfinished = unfinished_copy(database, copy)
     with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
         for camera in db.read_all_cameras():
             size = camera.width, camera.height
@@ -325,13 +325,18 @@ def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:
             fisheye = pycolmap.Camera.create_from_model_name(camera.camera_id, FISHEYE_MODEL, focal_px, *size)
             fisheye.has_prior_focal_length = True
             db.update_camera(fisheye)
-        photo = partial(Features().read, db)
-        for pair_id, matches in zip(*db.read_all_matches(), strict=True):
-            first, second = pycolmap.pair_id_to_image_pair(pair_id)
-            geometry = _verified(photo(first - 1), photo(second - 1), np.asarray(matches, np.uint32), options)
-            db.delete_two_view_geometry(first, second)
-            db.write_two_view_geometry(first, second, geometry)
+        verify_again(db, seed)
     finish_copy(unfinished, copy)
+
+
+def verify_again(db: pycolmap.Database, seed: int) -> None:
+    """Verify all matches anew, by the cameras and keypoints that the database has now."""
+    photo, options = partial(Features().read, db), _verification(seed)
+    for pair_id, matches in zip(*db.read_all_matches(), strict=True):
+        first, second = pycolmap.pair_id_to_image_pair(pair_id)
+        geometry = _verified(photo(first - 1), photo(second - 1), np.asarray(matches, np.uint32), options)
+        db.delete_two_view_geometry(first, second)
+        db.write_two_view_geometry(first, second, geometry)
 
 
 def unfinished_copy(database: Path, copy: Path) -> Path:
