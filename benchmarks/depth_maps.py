@@ -10,7 +10,6 @@ of matching (decoding photos, resampling, disparities, what neighbours agree on)
 import argparse
 import tempfile
 import time
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,8 @@ from pipeline.engine.display import SilentDisplay
 from pipeline.engine.workspace import Workspace
 from stages.contract import Inputs
 from stages.depth import Config
-from stages.depth.estimation import disagreement, match_pairs
-from stages.depth.files import depth_map_file, read_depth_map
+from stages.depth.estimation import depth_maps, disagreement, match_pairs
+from stages.depth.files import FOLDER
 from stages.depth.photos import one_thread_each, read_training_photos
 from stages.depth.point_cloud import fuse
 from stages.io.files import read_scene, read_tensors
@@ -36,17 +35,15 @@ def figures(inputs: Inputs, side: int) -> dict[str, Any]:
     progress = SilentDisplay()
     with tempfile.TemporaryDirectory() as name, one_thread_each():
         folder = Path(name)
-        for made in ("depth", "pairs"):
-            (folder / made).mkdir()
         started = time.process_time()
         pairs, left_out = photos.pairs(Config().neighbours)
         match_pairs(photos, pairs, folder, progress)
         matched = time.process_time()
-        read = lru_cache(48)(lambda number: read_depth_map(depth_map_file(folder, photos.views[number].file)))
+        read = depth_maps(photos, folder)
         maps = [read(number) for number in range(len(photos.views))]
         cloud = fuse(photos, read, sum(int(np.count_nonzero(m.distance)) for m in maps), lambda share: None)
         fused = time.process_time()
-        packed = sum(path.stat().st_size for path in (folder / "depth").iterdir())
+        packed = sum(path.stat().st_size for path in (folder / FOLDER).iterdir())
     points = read_tensors(inputs["normalise"] / "points.safetensors")
     off = np.concatenate([disagreement(photos, number, depth, points) for number, depth in enumerate(maps)])
     width, height = photos.viewpoints[0].size

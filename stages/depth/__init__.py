@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from stages.contract import Inputs, Progress, StageConfig, StageResult, Workload
+from stages.contract import Auto, Inputs, Progress, StageConfig, StageResult, Workload
 
 INPUTS = ("ingest", "normalise")
 VERSION = 1
@@ -23,14 +23,14 @@ PAIR_SECONDS, PHOTO_SECONDS = 0.35, 0.5  # of a core, at the default size
 
 
 class Config(StageConfig):
-    """Settings of stage depth."""
+    """How depth maps are made."""
 
-    downscale: float | None = Field(
-        default=None, ge=1, description="photo width / width of its depth map (default: a longer side of 640 pixels)"
+    downscale: Auto[float] = Field(
+        default=None, ge=1, description="Photo width divided by depth map width (default: a longer side of 640 pixels)."
     )
-    neighbours: int = Field(default=4, ge=2, le=12, description="photos that each photo is matched with")
-    seconds: float | None = Field(
-        default=None, gt=0, description="time limit of the stage: depth maps get smaller (default: none)"
+    neighbours: int = Field(default=4, ge=2, le=12, description="Number of photos that each photo is matched with.")
+    seconds: Auto[float] = Field(
+        default=None, gt=0, description="Time limit in seconds; depth maps get smaller (default: none)."
     )
 
 

@@ -16,8 +16,8 @@ import torch
 from nerf.runtime.parallel import in_order, take_over_cores, workers
 from stages.contract import Inputs, Progress, StageError, StageResult, listed
 from stages.depth.consistency import Candidate, DepthMap, agreed
-from stages.depth.files import depth_map_file, read_depth_map, write_depth_map
-from stages.depth.matching import MAX_VOLUME_BYTES, cost_volume_bytes, match
+from stages.depth.files import FOLDER, depth_map_file, read_depth_map, write_depth_map
+from stages.depth.matching import MAX_VOLUME_BYTES, candidates, cost_volume_bytes
 from stages.depth.photos import KEPT_PHOTOS, TrainingPhotos, one_thread_each, read_training_photos
 from stages.depth.point_cloud import ReadMap, fuse, ply_bytes
 from stages.depth.rectification import Rectified
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from stages.depth import Config
 
 CPU = torch.device("cpu")
+PAIRS = "pairs"  # folder of what pairs say, as long as photos wait for it
 MATCHING = 0.8  # of the stage's time
 BYTES_PER_PIXEL = 200  # of a rectified pair: directions, coordinates, windows of the refinement
 Pairs = Mapping[tuple[int, int], Rectified]
@@ -44,12 +45,10 @@ def estimate_depth(config: "Config", inputs: Inputs, folder: Path, progress: Pro
         raise _no_pairs(photos, left_out)
     _say_left_out(photos, pairs, left_out, progress)
     _check_memory(pairs)
-    for name in ("depth", "pairs"):
-        (folder / name).mkdir(exist_ok=True)
     with one_thread_each():
         match_pairs(photos, pairs, folder, progress)
         progress.update("fusing points", MATCHING)
-        read = lru_cache(KEPT_PHOTOS)(lambda number: read_depth_map(depth_map_file(folder, photos.views[number].file)))
+        read = depth_maps(photos, folder)
         facts, known = _facts(photos, read, read_tensors(inputs["normalise"] / "points.safetensors"))
         if not known:
             raise _nothing_agrees(len(pairs))
@@ -62,8 +61,8 @@ def estimate_depth(config: "Config", inputs: Inputs, folder: Path, progress: Pro
         photos.views[number].name: _names(photos, _neighbours(number, pairs)) for number in range(len(photos.views))
     }
     write_json(folder / "depth.json", facts | {"neighbours": neighbours})
-    shutil.rmtree(folder / "pairs")
-    return StageResult(outputs=("depth", "points.ply", "depth.json"), line=_line(photos, facts), facts=facts)
+    shutil.rmtree(folder / PAIRS)
+    return StageResult(outputs=(FOLDER, "points.ply", "depth.json"), line=_line(photos, facts), facts=facts)
 
 
 # --- pairs
@@ -71,6 +70,8 @@ def estimate_depth(config: "Config", inputs: Inputs, folder: Path, progress: Pro
 
 def match_pairs(photos: TrainingPhotos, pairs: Pairs, folder: Path, progress: Progress) -> None:
     """Match what is not there yet, and write the depth map of each photo once all of its pairs are."""
+    for name in (FOLDER, PAIRS):
+        (folder / name).mkdir(exist_ok=True)
     waiting = {number: set(_neighbours(number, pairs)) for number in range(len(photos.views))}
     for number in range(len(photos.views)):
         if depth_map_file(folder, photos.views[number].file).exists():
@@ -94,6 +95,11 @@ def match_pairs(photos: TrainingPhotos, pairs: Pairs, folder: Path, progress: Pr
         progress.update(f"matched {done} of {len(to_do)} pairs of photos", MATCHING * done / len(to_do))
 
 
+def depth_maps(photos: TrainingPhotos, folder: Path) -> ReadMap:
+    """The depth maps that :func:`match_pairs` wrote, by the photos' numbers."""
+    return lru_cache(KEPT_PHOTOS)(lambda number: read_depth_map(depth_map_file(folder, photos.views[number].file)))
+
+
 def _neighbours(number: int, pairs: Pairs) -> list[int]:
     """With which photos one is matched."""
     return sorted({one for pair in pairs if number in pair for one in pair} - {number})
@@ -105,16 +111,15 @@ def _match(photos: TrainingPhotos, pair: tuple[int, int], geometry: Rectified, w
     if not missing:
         return
     one, other = pair
-    viewpoints, pixels = [photos.viewpoints[n] for n in pair], [photos.pixels(n) for n in pair]
-    found = match(geometry, (viewpoints[0], viewpoints[1]), (pixels[0], pixels[1]))
-    for number, its_neighbour, side in ((one, other, 0), (other, one, 1)):
+    viewpoints = photos.viewpoints[one], photos.viewpoints[other]
+    found = candidates(geometry, viewpoints, (photos.pixels(one), photos.pixels(other)))
+    for number, neighbour, candidate in ((one, other, found[0]), (other, one, found[1])):
         if number in missing:
-            seen = found.seen_from_right() if side else found
-            write_side(_side_file(folder, number, its_neighbour), seen.of_photo(viewpoints[side], pixels[side].used))
+            write_side(_side_file(folder, number, neighbour), candidate)
 
 
 def _side_file(folder: Path, number: int, neighbour: int) -> Path:
-    return folder / "pairs" / f"{number:05d}-{neighbour:05d}"
+    return folder / PAIRS / f"{number:05d}-{neighbour:05d}"
 
 
 def write_side(path: Path, candidate: Candidate) -> None:

@@ -123,6 +123,14 @@ def match(pair: Rectified, photos: tuple[Viewpoint, Viewpoint], pixels: tuple[Pi
     return Disparities(pair, value[:, room:] + np.float32(pair.min_disparity), sigma[:, room:])
 
 
+def candidates(
+    pair: Rectified, photos: tuple[Viewpoint, Viewpoint], pixels: tuple[Pixels, Pixels]
+) -> tuple[Candidate, Candidate]:
+    """What a pair says of each of its photos."""
+    found = match(pair, photos, pixels)
+    return found.of_photo(photos[0], pixels[0].used), found.seen_from_right().of_photo(photos[1], pixels[1].used)
+
+
 class _Windows(NamedTuple):
     """Sums over the window around each pixel, once the right image is moved by the disparities: of squared gradients,
     of gradient times difference, of squared differences, of pixels; and where the squared gradients' middle is."""

@@ -63,14 +63,16 @@ class TrainingPhotos:
         return camera_rays(camera, width, height)
 
     @cached_property
-    def _cached(self) -> Callable[[int], Pixels]:
-        return lru_cache(KEPT_PHOTOS)(self._load)
+    def pixels(self) -> Callable[[int], Pixels]:
+        """By a photo's number its grey pixels of even contrast, and what masks and transparency leave of them."""
+        return lru_cache(KEPT_PHOTOS)(self._pixels)
 
-    def pixels(self, number: int) -> Pixels:
-        """Grey pixels of even contrast, and what masks and transparency leave of them."""
-        return self._cached(number)
+    @cached_property
+    def colours(self) -> Callable[[int], UInt8[np.ndarray, "h w 3"]]:
+        """By a photo's number the photo itself, sRGB; each is looked up from many others."""
+        return lru_cache(KEPT_PHOTOS)(self._colours)
 
-    def _load(self, number: int) -> Pixels:
+    def _pixels(self, number: int) -> Pixels:
         view, (width, height) = self.views[number], self.viewpoints[number].size
         pixels = load_pixels(self.ingest / view.file, width, height)
         used = np.ones((height, width), bool)
@@ -81,8 +83,7 @@ class TrainingPhotos:
         grey = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY)
         return Pixels(even_contrast(grey), used)
 
-    def colours(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
-        """The photo itself, sRGB."""
+    def _colours(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
         width, height = self.viewpoints[number].size
         return np.ascontiguousarray(load_pixels(self.ingest / self.views[number].file, width, height)[..., :3])
 

@@ -4,7 +4,7 @@ import time
 from typing import TYPE_CHECKING
 
 from stages.contract import Inputs, Progress
-from stages.depth.matching import match
+from stages.depth.matching import candidates
 from stages.depth.photos import TrainingPhotos, one_thread_each, read_training_photos
 from stages.hardware.device import processors
 from stages.io.files import read_scene
@@ -40,8 +40,6 @@ def _timed(photos: TrainingPhotos, neighbours: int) -> tuple[int, float]:
     with one_thread_each():
         started = time.perf_counter()
         for (one, other), pair in timed:
-            both = photos.viewpoints[one], photos.viewpoints[other]
-            found = match(pair, both, (photos.pixels(one), photos.pixels(other)))
-            found.of_photo(both[0], photos.pixels(one).used)
-            found.seen_from_right().of_photo(both[1], photos.pixels(other).used)
+            viewpoints = photos.viewpoints[one], photos.viewpoints[other]
+            candidates(pair, viewpoints, (photos.pixels(one), photos.pixels(other)))
         return len(pairs), (time.perf_counter() - started) / max(len(timed), 1)
