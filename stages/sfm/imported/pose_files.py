@@ -6,12 +6,8 @@ Photos are told apart by their own names, as ingest noted them. Cameras of photo
 upright as ingest turned the photos.
 """
 
-import os
-import unicodedata
-from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -44,6 +40,7 @@ from stages.sfm.imported.conventions import (
 )
 from stages.sfm.imported.llff import read_llff
 from stages.sfm.imported.orientation import fits_only_upright, pixel_map, stored_size
+from stages.sfm.imported.photo_names import other_spelling, photos_by_name
 from stages.sfm.imported.posed_photos import PosedPhoto, distinct, posed_photo, unusable, without_rays
 from stages.sfm.imported.transforms_intrinsics import contradictions, intrinsics_of, read_intrinsics
 
@@ -454,7 +451,7 @@ def _from_llff(
 
 def _from_colmap(folder: Path, photos: Sequence[Photo], convention: PoseConvention) -> ImportedPoses:
     given = _with_slashes(read_model(folder), photos)
-    photo_of = _by_name([image.file for image in given.images], photos)
+    photo_of = photos_by_name([image.file for image in given.images], photos)
     if not photo_of:
         raise _nothing_matches(str(folder), [image.file for image in given.images], photos)
     upright = _is_of_upright_photos(folder, given, photo_of)
@@ -480,7 +477,7 @@ def _from_colmap(folder: Path, photos: Sequence[Photo], convention: PoseConventi
         posed.values(),
         left_out,
     )
-    if others := [pair for one in kept.values() if (pair := _other_spelling(one.name, one.photo))]:
+    if others := [pair for one in kept.values() if (pair := other_spelling(one.name, one.photo))]:
         notes.append(
             Note(
                 "sfm.other-spellings",
@@ -516,103 +513,6 @@ def _is_of_upright_photos(folder: Path, given: SparseModel, photo_of: Mapping[in
         or (has_names_of_ingest and any(photo.image_name != photo.name for _, photo in pairs))
         or any(fits_only_upright(given.cameras[image.camera], photo) for image, photo in pairs)
     )
-
-
-def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
-    """Photo by index of its image: of the same name, else of the name that ingest gave it, else of a name whose
-    accents are composed in another way, else of the same name below a folder that all have, else of the same end, else
-    of the same name but for its ending, else but for small and capital letters."""
-    found: dict[int, Photo] = {}
-    taken: set[str] = set()
-    by_own, by_given = {photo.name: photo for photo in photos}, {photo.image_name: photo for photo in photos}
-    candidates = (
-        by_own,
-        by_given,
-        _by_key(names, photos, _composed),
-        _by_folder(names, photos),
-        _by_end(names, photos),
-    )
-    for photo_of in (*candidates, _by_key(names, photos, _without_ending), _by_key(names, photos, _without_case)):
-        for index, name in enumerate(names):
-            photo = photo_of.get(name)
-            if photo is not None and index not in found and photo.name not in taken:
-                found[index] = photo
-                taken.add(photo.name)
-    return found
-
-
-def _by_folder(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
-    """Photo by name of its image where all images, or else all photos, lie in a folder more: ``images/left/0.jpg`` is
-    ``left/0.jpg``. Of several such folders as few as have a match are left out."""
-    own = [photo.name for photo in photos]
-    of_images = ((_without_folders(names, count), own) for count in range(1, _shared_folders(names) + 1))
-    of_photos = ((names, _without_folders(own, count)) for count in range(1, _shared_folders(own) + 1))
-    for images, called in (*of_images, *of_photos):
-        by_name = dict(zip(map(_composed, called), photos, strict=True))
-        found = {
-            n: by_name[key] for n, image in zip(names, images, strict=True) if (key := _composed(image)) in by_name
-        }
-        if found:
-            return found
-    return {}
-
-
-def _shared_folders(names: Sequence[str]) -> int:
-    """How many folders all the names begin with."""
-    folders = (PurePosixPath(_composed(name)).parent.parts for name in names)
-    return len(list(takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False))))
-
-
-def _without_folders(names: Sequence[str], count: int) -> list[str]:
-    return [str(PurePosixPath(*PurePosixPath(name).parts[count:])) for name in names]
-
-
-def _by_end(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
-    """Photo by name of its image where one is called ``0.jpg``, say, and the other ``left/0.jpg``, and no other image
-    or photo is called ``0.jpg`` in any folder."""
-    by_last: dict[str, list[Photo]] = {}
-    for photo in photos:
-        by_last.setdefault(_last(photo.name), []).append(photo)
-    images = Counter(map(_last, names))
-    found: dict[str, Photo] = {}
-    for name in names:
-        last = _last(name)
-        same = by_last.get(last, [])
-        if images[last] == len(same) == 1:
-            image, photo = f"/{_composed(name)}", f"/{_composed(same[0].name)}"
-            if image.endswith(photo) or photo.endswith(image):
-                found[name] = same[0]
-    return found
-
-
-def _by_key(names: Sequence[str], photos: Sequence[Photo], key: Callable[[str], str]) -> dict[str, Photo]:
-    """Photo by name of its image where both names have the same key, and no other image or photo has it."""
-    images = Counter(map(key, names))
-    own = Counter(key(photo.name) for photo in photos)
-    by_key = {key_of: photo for photo in photos if own[key_of := key(photo.name)] == 1}
-    return {name: by_key[key_of] for name in names if images[key_of := key(name)] == 1 and key_of in by_key}
-
-
-def _other_spelling(name: str, photo: Photo) -> str | None:
-    """A photo and its image in words, where their names differ by more than folders and accents."""
-    same = name == photo.image_name or _last(name) == _last(photo.name)
-    return None if same else f"{photo.name} ({name})"
-
-
-def _composed(name: str) -> str:
-    return unicodedata.normalize("NFC", name)
-
-
-def _last(name: str) -> str:
-    return PurePosixPath(_composed(name)).name
-
-
-def _without_ending(name: str) -> str:
-    return os.path.splitext(_composed(name))[0]
-
-
-def _without_case(name: str) -> str:
-    return _composed(name).casefold()
 
 
 # --- both

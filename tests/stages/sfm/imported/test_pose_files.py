@@ -15,7 +15,8 @@ from stages.io.sparse_model import SparseImage, SparseModel
 from stages.io.transforms_export import intrinsics
 from stages.sfm.colmap.models import write_model
 from stages.sfm.imported.conventions import PoseConvention
-from stages.sfm.imported.pose_files import ImportedPoses, _by_name, read_poses
+from stages.sfm.imported.photo_names import photos_by_name
+from stages.sfm.imported.pose_files import ImportedPoses, read_poses
 from tests.refusals import codes, refused
 
 W, H = 60, 40
@@ -559,7 +560,7 @@ def test_images_have_the_photos_of_their_names(images: list[str], own: list[str]
     for name in own:
         file = f"images/{name.replace('ä.jpg', 'a.png')}"
         photos.append(Photo(name, file, W, H, 0, None, None, False, 1.0))
-    assert {index: photo.name for index, photo in _by_name(images, photos).items()} == matches
+    assert {index: photo.name for index, photo in photos_by_name(images, photos).items()} == matches
 
 
 def test_cameras_of_photos_with_another_ending_are_taken_and_named(tmp_path: Path) -> None:
