@@ -99,7 +99,7 @@ def test_sparse_points_decide_over_patches(sparse: list[tuple[int, int, float]],
 def test_patches_of_few_pixels_are_chance(pixels: int) -> None:
     distance = np.zeros((10, 40), np.float32)
     distance[4, :pixels] = 2
-    nowhere = SparseDepths(*np.zeros((2, 0), int), np.zeros(0))
+    nowhere = SparseDepths(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
     kept = plausible(DepthMap(distance, distance, distance.astype(np.uint8)), nowhere)
     assert (kept.distance > 0).sum() == (pixels if pixels >= MIN_PATCH_PIXELS else 0)
 
