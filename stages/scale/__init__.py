@@ -1,0 +1,66 @@
+"""Stage scale: how many metres a unit of the sfm frame is, by markers in the photos, a distance, or GPS.
+
+A stage of its own: a length that becomes known after training changes the files in metres, and trains nothing again.
+"""
+
+from pathlib import Path
+
+from pydantic import Field, field_validator
+
+from stages.contract import Auto, Inputs, Progress, StageConfig, StageResult, Workload
+from stages.scale.lengths import parse_length, parse_point
+from stages.scale.marker_names import parse_marker
+
+INPUTS = ("ingest", "sfm", "normalise")
+VERSION = 1
+EXIT_CODE = 22
+RESUMES = False
+PUBLISHED = ("scale.json",)
+
+
+class Config(StageConfig):
+    """What has a known length."""
+
+    marker: tuple[str, ...] = Field(
+        default=(),
+        description=(
+            "A printed ArUco marker or AprilTag with the length of its black square, DICTIONARY:ID=LENGTH, such as "
+            "4X4_50:7=50mm or APRILTAG_36h11:0=2in. (repeatable)"
+        ),
+    )
+    distance: Auto[tuple[str, str, str]] = Field(
+        default=None,
+        description=(
+            "Two points X,Y,Z in the frame of output/transforms.json and the distance between them, such as "
+            "0.1,0.2,3 0.4,0.2,3 1.25m (default: none)."
+        ),
+    )
+
+    @field_validator("marker")
+    @classmethod
+    def _markers(cls, markers: tuple[str, ...]) -> tuple[str, ...]:
+        names = [parse_marker(marker).name for marker in markers]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"marker {twice} is given twice")
+        return markers
+
+    @field_validator("distance")
+    @classmethod
+    def _distance(cls, distance: tuple[str, str, str] | None) -> tuple[str, str, str] | None:
+        if distance is not None:
+            if parse_point(distance[0]) == parse_point(distance[1]):
+                raise ValueError(f"both points are {distance[0]}")
+            parse_length(distance[2])
+        return distance
+
+
+def expected_seconds(config: Config, workload: Workload) -> float:
+    """Next to nothing without markers; with them the photos are decoded and searched."""
+    return 0.3 + bool(config.marker) * 3 * workload.photos.reading_seconds(workload.cores)
+
+
+def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
+    """Measure what has a known length; write scale.json."""
+    from stages.scale.references import measure_scale
+
+    return measure_scale(config, inputs, folder, progress)
