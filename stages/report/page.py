@@ -33,6 +33,7 @@ from stages.report.cameras import (
 from stages.report.effects import effects_table
 from stages.report.plots import ORDER_COLOURS, Score, camera_svgs, curve_svg, falloff_svg
 from stages.report.profile import profile_bar
+from stages.scale.lengths import length_in_words
 from stages.tradeoff.plots import COLUMNS, plot_svg, rendering_sentence, table_cells
 from stages.train.curve import diminishing_returns_message, doubling_message, more_option, predicted_gain, ssim_message
 
@@ -93,6 +94,7 @@ def summarise(results: Results) -> dict[str, Any]:
     manifests, registration, metrics = results.manifests, results.registration or {}, results.metrics or {}
     train = manifests["train"]["facts"] if "train" in manifests else {}
     mesh = manifests["mesh"]["facts"] if "mesh" in manifests else None
+    scale = manifests["scale"]["facts"] if "scale" in manifests else {}
     cameras = _camera_report(results)
     return {
         "photos": len(results.photos["photos"]) if results.photos else None,
@@ -107,6 +109,7 @@ def summarise(results: Results) -> dict[str, Any]:
         "training_profile": results.profile,
         **{key: metrics.get(key) for key in ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")},
         "scored_fraction": metrics.get("fraction"),
+        "metres_per_unit": scale.get("metres_per_unit"),
         "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
         "verdict": metrics.get("verdict", "Not measured: stage evaluate has not run."),
     }
@@ -135,6 +138,7 @@ def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
         "duration": duration,
         "short": short_count,
         "thousands": "{:,}".format,
+        "metres": length_in_words,
         "value": _value,
         "quoted": shell_quoted,
     }

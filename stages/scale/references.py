@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from nerf.geometry.scene import Scene, View
-from stages.contract import Inputs, Progress, StageResult, listed
+from stages.contract import Inputs, Note, Progress, StageResult, listed
 from stages.io.files import read_json, read_scene, write_json
 from stages.io.pixels import load_pixels, loaders
 from stages.scale.detection import by_dictionary, cells_of, find_markers, locate_corners, luminance
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 DISTANCE_ERROR = 0.01  # of two points that somebody picked
 READING_ERROR = 0.01  # of lengths read from a ruler or set in a printer: two that differ by less agree
-SURE = 3.0  # standard errors
+MAX_STANDARD_ERRORS = 3.0  # between two lengths that agree
 MAX_ERROR = 0.05  # of a scale that is worth having
 MAX_IRREGULARITY = 0.04  # of a square: one that is cut off, bent or printed out of proportion has no one side
 MIN_AGREEING = 2 / 3  # of the photos that show a marker, about its place
@@ -112,7 +112,7 @@ def without_contradictions(references: Sequence[Reference], progress: Progress) 
 def _agree(one: Reference, other: Reference) -> bool:
     assert one.metres_per_unit and other.metres_per_unit and one.relative_error and other.relative_error
     apart = abs(math.log(one.metres_per_unit / other.metres_per_unit))
-    return apart <= max(READING_ERROR, SURE * math.hypot(one.relative_error, other.relative_error))
+    return apart <= max(READING_ERROR, MAX_STANDARD_ERRORS * math.hypot(one.relative_error, other.relative_error))
 
 
 # --- markers
@@ -128,7 +128,7 @@ def _markers(config: "Config", scene: Scene, ingest: Path, progress: Progress) -
     for marker in markers:
         seen = sightings[marker]
         if not seen:
-            yield _refused(marker, 0, "mirrored" if marker in mirrored else "not-found", progress)
+            yield _refused(marker, 0, MIRRORED if marker in mirrored else NOT_FOUND, progress)
         else:
             yield _measured(marker, seen, scene, progress)
 
@@ -189,17 +189,17 @@ def _measured(marker: Marker, seen: Sequence[_Sighting], scene: Scene, progress:
     """What a marker says that is seen somewhere."""
     photos = len({sighting.view for sighting in seen})
     if photos < 2:
-        return _refused(marker, photos, "one-photo", progress)
+        return _refused(marker, photos, ONE_PHOTO, progress)
     if any(sighting.times > 1 for sighting in seen):
-        return _refused(marker, photos, "repeated", progress)
+        return _refused(marker, photos, REPEATED, progress)
     square = fit_square(_sightings(seen, scene))
     if square is None or square.agreeing.mean() < MIN_AGREEING:
-        return _refused(marker, photos, "several-places", progress)
+        return _refused(marker, photos, SEVERAL_PLACES, progress)
     error = square.standard_error / square.side
     if not error < MAX_ERROR:
-        return _refused(marker, photos, "uncertain", progress)
-    if square.irregularity > max(MAX_IRREGULARITY, SURE * error):
-        return _refused(marker, photos, "not-square", progress)
+        return _refused(marker, photos, UNCERTAIN, progress)
+    if square.irregularity > max(MAX_IRREGULARITY, MAX_STANDARD_ERRORS * error):
+        return _refused(marker, photos, NOT_SQUARE, progress)
     return _reference(marker, square, error, scene)
 
 
@@ -219,21 +219,29 @@ def _reference(marker: Marker, square: Square, error: float, scene: Scene) -> Re
     return Reference("marker", marker.name, metres_per_unit, error, int(square.agreeing.sum()), None, corners)
 
 
-_PROBLEMS = {
-    "not-found": "no photo shows it well enough to read it: it should lie flat, in a white margin one cell wide, "
-    "and be 30 pixels or more wide in several photos",
-    "mirrored": "the photos show its mirror image: print it as it is, or give unmirrored photos",
-    "one-photo": "only 1 photo shows it, and it takes two from different places",
-    "repeated": "a photo shows it twice: print each marker once",
-    "several-places": "the photos disagree about where it is: it was moved, or printed more than once",
-    "uncertain": f"its side is known to no better than {MAX_ERROR:.0%}: show it larger, and from more places",
-    "not-square": "its four sides differ: it is cut off, bent, or printed out of proportion",
-}
+NOT_FOUND = Note(
+    "scale.not-found",
+    "no photo shows it well enough to read it: it should lie flat, in a white margin one cell wide, and be 30 pixels or "
+    "more wide in several photos",
+)
+MIRRORED = Note(
+    "scale.mirrored", "the photos show its mirror image: print it as it is, or give photos that are not mirrored"
+)
+ONE_PHOTO = Note("scale.one-photo", "only one photo shows it, and it takes two from different places")
+REPEATED = Note("scale.repeated", "a photo shows it twice: print each marker once")
+SEVERAL_PLACES = Note(
+    "scale.several-places", "the photos disagree about where it is: it was moved, or printed more than once"
+)
+UNCERTAIN = Note(
+    "scale.uncertain", f"its side is known to no better than {MAX_ERROR:.0%}: show it larger, and from more places"
+)
+NOT_SQUARE = Note("scale.not-square", "its four sides differ: it is cut off, bent, or printed out of proportion")
 
 
-def _refused(marker: Marker, photos: int, problem: str, progress: Progress) -> Reference:
-    progress.note(f"scale.{problem}", f"marker {marker.name} is not used: {_PROBLEMS[problem]}")
-    return Reference("marker", marker.name, photos=photos, problem=problem)
+def _refused(marker: Marker, photos: int, problem: Note, progress: Progress) -> Reference:
+    told = problem._replace(text=f"marker {marker.name} is not used: {problem.text}")
+    progress.note(*told)
+    return Reference("marker", marker.name, photos=photos, problem=problem.code.removeprefix("scale."))
 
 
 # --- a distance, GPS
@@ -259,7 +267,7 @@ def _gps(georeference: dict[str, Any] | None, scene: Scene) -> Reference | None:
 def _compare_with_gps(gps: Reference, metres: float, progress: Progress) -> None:
     assert gps.metres_per_unit and gps.relative_error
     apart = abs(math.log(gps.metres_per_unit / metres))
-    if apart > max(MAX_ERROR, SURE * gps.relative_error):
+    if apart > max(MAX_ERROR, MAX_STANDARD_ERRORS * gps.relative_error):
         progress.note(
             "scale.gps-disagrees",
             f"GPS says 1 unit = {_with_error(gps)}, {apart:.0%} off what the given lengths say: these are used",

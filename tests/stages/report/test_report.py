@@ -43,7 +43,7 @@ def test_training_that_another_one_went_on_from_counts_in_all(tmp_path: Path, pr
     before = written(inputs, tmp_path / "before", progress)[1]["total_seconds"]
     write_json(inputs["train"] / "manifest.json", manifest | more)
     html, summary = written(inputs, tmp_path / "out", progress)
-    assert summary["total_seconds"] == pytest.approx(before + 310.5) and summary["total_seconds"] > 483.3
+    assert summary["total_seconds"] == pytest.approx(before + 313.0) and summary["total_seconds"] > 483.3
     assert summary["stage_seconds"]["train"] == 181.7
     assert "in all 10 min" in html
 
@@ -59,8 +59,8 @@ def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path
         "cameras_doubtful": False,
         "field": "vanilla",
         "train_seconds": 183.3,
-        "total_seconds": pytest.approx(58.2 + 181.7 + 60.1 + 4 * 2.5),
-        "stage_seconds": {"ingest": 2.5, "sfm": 58.2, "normalise": 2.5, "train": 181.7}
+        "total_seconds": pytest.approx(58.2 + 181.7 + 60.1 + 5 * 2.5),
+        "stage_seconds": {"ingest": 2.5, "sfm": 58.2, "normalise": 2.5, "scale": 2.5, "train": 181.7}
         | {"evaluate": 2.5, "render": 60.1, "mesh": 2.5},
         "expected_seconds": {},
         "training_profile": SPANS,
@@ -68,6 +68,7 @@ def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path
         "ssim": 0.62,
         "psnr_mean_image": 12.9,
         "psnr_nearest_view": 14.2,
+        "metres_per_unit": 0.5,
         "scored_fraction": 0.25,
         "mesh": {"vertices": 105_900, "faces": 211_817, "watertight": False},
         "verdict": "Better than the nearest training photo by 7.3 dB but soft.",
