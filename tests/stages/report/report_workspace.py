@@ -24,7 +24,7 @@ CAMERA_MODELS = [
     for model, place, free, error, worse, noise, reason in [
         ("SIMPLE_RADIAL", "fixed", 2, 0.6912, 0.0812, 0.0101, None),
         ("OPENCV", "refined", 8, 0.6100, 0.0, 0.0, None),
-        ("OPENCV_FISHEYE", "refined", 8, None, None, None, "its distortion cannot be undone at 2.0% of the pixels"),
+        ("OPENCV_FISHEYE", "refined", 8, None, None, None, "its distortion has no inverse at 2.0% of the pixels"),
     ]
 ]
 SPANS = {"profiled_steps": 19, "seconds": 5.0, "core_seconds": 10.0, "efficiency": 0.6} | {

@@ -165,7 +165,7 @@ def test_page_shows_the_evidence_for_the_camera_model(tmp_path: Path, progress: 
     assert "by at most 3 times the noise of the difference" in html
     for cells in ('0.6912</td><td class="number">0.0812 ± 0.0101</td><td></td>', "<td>chosen</td>"):
         assert cells in html
-    assert "–</td><td>its distortion cannot be undone at 2.0% of the pixels</td>" in html
+    assert "–</td><td>its distortion has no inverse at 2.0% of the pixels</td>" in html
     assert "pose of the median photo is known to 0.26 px" in html
     assert "the least certain one (IMG_0023.jpg) to 0.48 px" in html
     path = inputs["sfm"] / "registration.json"
@@ -180,7 +180,7 @@ STRATEGIES = [
     dict(zip(("strategy", "registered", "points", "reprojection_px", "kept", "skipped"), row, strict=True))
     for row in [
         ("default", 20, 7000, 0.6, False, None),
-        ("fisheye", None, None, None, False, "4 of 24 photos missing is not worth starting over"),
+        ("fisheye", None, None, None, False, "starting over is not worth it for 4 of 24 photos"),
         ("relaxed ratio test", 23, 8123, 0.61, True, None),
         ("weaker initial pair", 0, 0, None, False, None),
         ("other seed", 23, 8100, 0.6, False, None),
@@ -200,7 +200,7 @@ def test_page_shows_what_was_tried_to_find_the_cameras(tmp_path: Path, progress:
     table = html[html.index("Strategies tried") :].partition("</table>")[0]
     assert row.findall(table) == [
         ("default", "20", "7,000", "0.60", "fewer photos"),
-        ("fisheye", "–", "–", "–", "skipped: 4 of 24 photos missing is not worth starting over"),
+        ("fisheye", "–", "–", "–", "skipped: starting over is not worth it for 4 of 24 photos"),
         ("relaxed ratio test", "23", "8,123", "0.61", "kept"),
         ("weaker initial pair", "0", "0", "–", "no model"),
         ("other seed", "23", "8,100", "0.60", "fewer points"),
