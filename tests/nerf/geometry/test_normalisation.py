@@ -354,7 +354,7 @@ def test_a_given_region_is_taken_as_it_is() -> None:
 def test_photos_from_one_place_without_points_have_no_scale() -> None:
     poses = ring(radius=1.0)
     poses[:, :, 3] = 0
-    with pytest.raises(ValueError, match="all cameras stand in one place and no point is known"):
+    with pytest.raises(ValueError, match="all cameras have the same position"):
         normalise(seen_by(poses, np.zeros((0, 3))), None)
 
 

@@ -47,7 +47,7 @@ def test_all_notes_are_kept(tmp_path: Path, progress: Any) -> None:
     notes = read_json(tmp_path / "out/notes.json")
     assert notes[:10] == progress.notes[:10] and len(notes) == 12
     strays = "masks/stray0.png, masks/stray1.png, masks/stray2.png and 4 more"
-    assert progress.codes == ["ingest.stray-masks", *["ingest.assumed"] * 9, "ingest.more-notes"]
+    assert progress.codes[:11] == ["ingest.stray-masks", *["ingest.assumed"] * 9, "ingest.more-notes"]
     assert progress.names("ingest.stray-masks", strays)
     assert notes[1].startswith("c00.tif: ")
     assert progress.names("ingest.more-notes", 2, "notes.json")

@@ -157,7 +157,7 @@ def _write_metrics(folder: Path, scene: Scene, size: tuple[int, int]) -> None:
     }
     words = {
         "notes": [{"code": "evaluate.no-lpips", "text": "LPIPS is not computed"}],
-        "verdict": "Better than the nearest training photo by 7.3 dB but soft.",
+        "verdict": "Better than the nearest training view by 7.3 dB but soft.",
     }
     write_json(folder / "metrics.json", {"psnr_interval": [21.1, 21.9], "images": images} | overall | counts | words)
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from stages.sfm.imported.pose_files import ImportedPoses, read_poses
-from tests.refusals import codes
+from tests.refusals import codes, refused
 from tests.stages.sfm.imported.test_pose_files import LENS, NAMES, PHOTOS, frame
 
 

@@ -234,7 +234,7 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"transform_matrix": np.diag([1, 1, 0, 1]).tolist()}, r"it is no rotation: its determinant is 0"),
         (
             {"transform_matrix": matrix(1).T.tolist()},
-            r"the last row .* is 1, 2, -1, 1 and not 0, 0, 0, 1: it may be trans",
+            r"the last row .* is 1, 2, -1, 1 .*: it may be trans",
         ),
         ({"camera_angle_x": 40, "fl_x": None}, r"its camera_angle_x is 40; it must be in radians"),
         ({"intrinsics": [[50, 0, 31], [0, 50, 19]]}, r"its intrinsics has 6 numbers"),
@@ -403,7 +403,7 @@ def test_no_frame_with_a_photo_is_an_error(read) -> None:
 def test_a_photo_has_one_frame(read) -> None:
     for second in (frame(1, fl_x=51.0), frame(1, transform_matrix=matrix(2).tolist())):
         differs = "fl_x" if "fl_x" in second else "transform_matrix"
-        with refused("sfm.two-frames", "transforms.json", "ä1.png", "./1", f"differ in {differs}"):
+        with refused("sfm.two-frames", "transforms.json", "ä1.png", "./1", differs):
             read([frame(1), second], **LENS)
 
 
