@@ -25,7 +25,6 @@ KERNELS = load_backend(chosen_backend("cpu"), "cpu")
 OUTDOORS = HashGridField(replace(GRID, background_model=True), 5, KERNELS)
 OUTDOORS.background_table.normal_(generator=torch.Generator().manual_seed(6))
 KINDS = {"vanilla": VanillaNerf(SMALL, seed=5), "grid": HashGridField(GRID, 5, KERNELS), "sky": OUTDOORS}
-BY_TORCH = "the hash-grid field is computed by torch alone, as it was trained"
 INFO = {"background": [1.0, 1.0, 1.0], "downscale": 2.5, "steps": 7, "rays": 700, "effects": {}}
 
 

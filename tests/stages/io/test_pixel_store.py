@@ -145,7 +145,7 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path, progress: SilentProgres
     store = store_of(tmp_path)
     with pytest.raises(OSError, match="truncated"):
         fill(store, fails, progress)
-    with pytest.raises(ValueError, match=r"0\.png has shape \(3, 5\) and not \(3, 5, 3\)"):
+    with pytest.raises(ValueError, match=r"0\.png has shape \(3, 5\) instead of \(3, 5, 3\)"):
         fill(store, lambda index: painted(index)[..., 0], progress)
     assert [path.suffix for path in store.path.parent.iterdir()] == [".lock"]
     fill(store, painted, progress)

@@ -261,7 +261,7 @@ def test_a_region_without_size_is_refused(inputs, progress) -> None:
 
 
 def test_photos_from_one_place_are_refused_with_a_hint(inputs, progress) -> None:
-    with refused("normalise.no-scale", "all cameras stand in one place"):
+    with refused("normalise.no-scale", "the same position"):
         run(inputs(one_place=True), progress)
 
 
