@@ -4,8 +4,10 @@ A stage of its own: a length that becomes known after training changes the files
 """
 
 from pathlib import Path
+from typing import Annotated
 
 from pydantic import Field, field_validator
+from tyro.conf import UseAppendAction, arg
 
 from stages.contract import Auto, Inputs, Progress, StageConfig, StageResult, Workload
 from stages.scale.lengths import parse_length, parse_point
@@ -21,17 +23,17 @@ PUBLISHED = ("scale.json",)
 class Config(StageConfig):
     """What has a known length."""
 
-    marker: tuple[str, ...] = Field(
+    marker: Annotated[tuple[str, ...], UseAppendAction, arg(metavar="DICTIONARY:ID=LENGTH")] = Field(
         default=(),
         description=(
-            "A printed ArUco marker or AprilTag with the length of its black square, DICTIONARY:ID=LENGTH, such as "
-            "4X4_50:7=50mm or APRILTAG_36h11:0=2in. (repeatable)"
+            "A printed ArUco marker or AprilTag with the length of its black square, such as 4X4_50:7=50mm or "
+            "APRILTAG_36h11:0=2in."
         ),
     )
-    distance: Auto[tuple[str, str, str]] = Field(
+    distance: Annotated[Auto[tuple[str, str, str]], arg(metavar="X,Y,Z X,Y,Z LENGTH")] = Field(
         default=None,
         description=(
-            "Two points X,Y,Z in the frame of output/transforms.json and the distance between them, such as "
+            "Two points in the frame of output/transforms.json and the distance between them, such as "
             "0.1,0.2,3 0.4,0.2,3 1.25m (default: none)."
         ),
     )
@@ -39,10 +41,8 @@ class Config(StageConfig):
     @field_validator("marker")
     @classmethod
     def _markers(cls, markers: tuple[str, ...]) -> tuple[str, ...]:
-        names = [parse_marker(marker).name for marker in markers]
-        if twice := next((name for name in names if names.count(name) > 1), None):
-            raise ValueError(f"marker {twice} is given twice")
-        return markers
+        """Of several lengths of a marker the last counts: a command may correct what the workspace has recorded."""
+        return tuple({parse_marker(marker).name: marker for marker in markers}.values())
 
     @field_validator("distance")
     @classmethod

@@ -221,8 +221,8 @@ def _reference(marker: Marker, square: Square, error: float, scene: Scene) -> Re
 
 NOT_FOUND = Note(
     "scale.not-found",
-    "no photo shows it well enough to read it: it should lie flat, in a white margin one cell wide, and be 30 pixels or "
-    "more wide in several photos",
+    "no photo shows it well enough to read it: it should lie flat, in a white margin one cell wide, and be 30 pixels "
+    "wide or wider in several photos",
 )
 MIRRORED = Note(
     "scale.mirrored", "the photos show its mirror image: print it as it is, or give photos that are not mirrored"

@@ -272,7 +272,7 @@ def test_small_sets_are_expected_to_take_as_long_as_measured() -> None:
     assert Photos(50, 0.75).reading_seconds(2) == pytest.approx(0.75)
     times = expected(Settings(), Photos(50, 0.75))
     known = {stage: seconds for stage, seconds in times.items() if seconds is not None}
-    before = {"ingest": 1.1, "sfm": 57.9, "normalise": 0.3, "effects": 10.0, "report": 2.0}
+    before = {"ingest": 1.1, "sfm": 57.9, "normalise": 0.3, "scale": 0.3, "effects": 10.0, "report": 2.0}
     assert known == pytest.approx(before, abs=1.0)
 
 

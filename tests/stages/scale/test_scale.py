@@ -200,7 +200,6 @@ def test_markers_are_read_as_people_write_them(text: str, marker: Marker) -> Non
     "options",
     [
         *({"marker": (text,)} for text in ("4X4_50:7", "4X4:7=50mm", "4X4_50:50=5cm", "4X4_50:7=50", "4X4_50:7=-5cm")),
-        {"marker": ("4X4_50:7=5cm", "dict_4x4_50:7=6cm")},
         *({"distance": one} for one in (("1,2", "1,2,3", "1m"), ("1,2,3", "1,2,3", "1m"), ("1,2,3", "1,2,nan", "1m"))),
         {"distance": ("1,2,3", "3,2,1", "0m")},
     ],
@@ -208,6 +207,11 @@ def test_markers_are_read_as_people_write_them(text: str, marker: Marker) -> Non
 def test_what_cannot_be_meant_is_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError):
         scale.Config(**options)
+
+
+def test_the_last_length_of_a_marker_counts() -> None:
+    given = ("4X4_50:7=5cm", "tag36h11:3=2in", "dict_4x4_50:7=6cm")
+    assert scale.Config(marker=given).marker == ("dict_4x4_50:7=6cm", "tag36h11:3=2in")
 
 
 def test_lengths_have_units() -> None:
