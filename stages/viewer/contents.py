@@ -26,7 +26,7 @@ from stages.render.path import median_camera
 from stages.render.renderer import Renderer, load_renderer
 from stages.sfm.colmap.cameras import focal_lengths_and_centre, project
 from stages.train.data import PhotoReader, view_rays
-from stages.viewer.tables import FEATURES, Table, description, quantised, sections, with_table
+from stages.viewer.tables import FEATURES, Bits, Table, description, quantised, sections, with_table
 
 if TYPE_CHECKING:
     from stages.viewer import Config
@@ -68,9 +68,7 @@ def load(config: "Config", inputs: Inputs, progress: Progress) -> Contents:
     field, scene = read_json(inputs["train"] / "field.json"), read_scene(inputs["normalise"])
     renderer = load_renderer(inputs["train"], progress=progress)
     if not isinstance(renderer.field, HashGridField):
-        why = (
-            "the page draws hash-grid fields alone: a vanilla NeRF's network is hundreds of times as much work a point"
-        )
+        why = "the page draws hash-grid fields alone: a vanilla NeRF's network is over 100 times as much work a point"
         progress.note("viewer.not-drawn", f"viewer.html says only that it cannot show this field: {why}")
         return Contents({"field": None}, {}, None)
     if renderer.field.settings.features_per_level != FEATURES:
@@ -84,7 +82,8 @@ def load(config: "Config", inputs: Inputs, progress: Progress) -> Contents:
     parts = sections(renderer.field, table) | {"palette": _palette()} | _points(inputs)
     header = {
         "field": description(renderer.field, table)
-        | {"background": field["background"], "log_gain": _log_gain(new_view_effects(field))},
+        | _gains(new_view_effects(field))
+        | {"background": field["background"]},
         "scene": _scene(scene, inputs),
         "exposure": "exposure" in field["effects"],
         "appearance": new_view_words(field),
@@ -108,14 +107,16 @@ def _table(
     """The table in 8 bits a number, or in 16 where these lose more than MAX_LOSS_DB, or as asked for."""
     field = renderer.field
     assert isinstance(field, HashGridField)
-    for bits in (8, 16):
-        if config.bits in ("auto", str(bits)):
-            progress.update(f"comparing {bits} bits with the trained field", 0.1)
-            table = quantised(field.layout, field.table, bits)
-            comparison = _compared(renderer, with_table(field, table), info, scene, inputs)
-            if config.bits != "auto" or comparison.loss_db <= MAX_LOSS_DB:
-                return table, comparison
-    return table, comparison
+
+    def packed(bits: Bits) -> tuple[Table, Comparison]:
+        progress.update(f"comparing {bits} bits with the trained field", 0.1)
+        table = quantised(field.layout, field.table, bits)
+        return table, _compared(renderer, with_table(field, table), info, scene, inputs)
+
+    if config.bits == "16":
+        return packed(16)
+    chosen = packed(8)
+    return packed(16) if config.bits == "auto" and chosen[1].loss_db > MAX_LOSS_DB else chosen
 
 
 def _compared(
@@ -136,19 +137,21 @@ def _compared(
     return Comparison(len(views), float(trained), float(of_packed))
 
 
-def _log_gain(effects: tuple[ColourEffect, ...]) -> list[float]:
-    """Of what new views show: the sum of constant log gains, per channel."""
-    total = np.zeros(3)
+def _gains(effects: tuple[ColourEffect, ...]) -> dict[str, list[float]]:
+    """``log_gain`` on the optical axis, per channel, and ``falloff`` from there: vignetting's three coefficients and
+    1 / (4 sin²(θ/2)) of the corner."""
+    log_gain, falloff = np.zeros(3), [0.0] * 4
     for effect in effects:
         if isinstance(effect, ExposureModel):
-            total += effect.log_gain[0].cpu().double().numpy()
+            log_gain += effect.log_gain[0].cpu().double().numpy()
         elif isinstance(effect, VignettingModel):
-            total += float(effect.mean_log_gain[0]) + float((effect.falloff[0] @ effect.mean_terms).double())
+            on_axis = effect.mean_log_gain[0] + effect.falloff[0] @ effect.mean_terms
+            log_gain += float(on_axis)
+            falloff = [*effect.falloff[0].tolist(), float(effect.per_corner[0])]
         else:
-            raise StageError(
-                "viewer.effect", "cannot pack the field", f"no shader knows the effect {effect.name}", "Update."
-            )
-    return total.tolist()
+            what, why = "cannot pack the field", f"no shader knows the effect {effect.name}"
+            raise StageError("viewer.effect", what, why, f"Run again with --effect {effect.name}=off.")
+    return {"log_gain": log_gain.tolist(), "falloff": falloff}
 
 
 # --- what was photographed
@@ -186,23 +189,13 @@ def _lens(camera: Camera) -> list[float]:
 
 def _view(scene: Scene, view: View, field: dict[str, Any]) -> dict[str, Any]:
     """A camera with its photo's own exposure and vignetting."""
-    effects = photo_effects(field, scene, view)
-    gain, falloff = np.zeros(3), [0.0] * 4
-    for effect in effects:
-        if isinstance(effect, ExposureModel):
-            gain += effect.log_gain[0].double().numpy()
-        elif isinstance(effect, VignettingModel):
-            gain += float(effect.mean_log_gain[0]) + float((effect.falloff[0] @ effect.mean_terms).double())
-            falloff = [*effect.falloff[0].tolist(), float(effect.per_corner[0])]
     return {
         "name": view.name,
         "split": view.split,
         "pose": view.scene_from_camera.tolist(),
         "lens": _lens(scene.cameras[view.camera]),
         "near_far": [view.near, view.far],
-        "log_gain": gain.tolist(),
-        "falloff": falloff,
-    }
+    } | _gains(photo_effects(field, scene, view))
 
 
 def _inverse_depths(renderer: Renderer, scene: Scene) -> list[float]:

@@ -81,8 +81,8 @@ def _in_bytes(values: Float[np.ndarray, "n"]) -> tuple[Int8[np.ndarray, "n"], fl
     def error(scale: float) -> float:
         return float(np.square(codes(scale) * scale - values).sum(dtype=np.float64))
 
-    best = np.float32(min((largest / MAX_CODE * share for share in SCALES), key=error))
-    return codes(best).astype(np.int8), float(best)
+    best = float(np.float32(min((largest / MAX_CODE * share for share in SCALES), key=error)))
+    return codes(best).astype(np.int8), best
 
 
 def _rows(layout: GridLayout, level: int) -> slice:

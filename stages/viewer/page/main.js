@@ -1,6 +1,5 @@
 // The viewer: what is shown, and how its parts hang together. Its public functions are what tests call, too.
 
-const NO_FALLOFF = [0, 0, 0, 0];
 const SAVE_LINK_MS = 400; // without a move until the address holds the view
 const BACKGROUNDS = { white: [1, 1, 1], black: [0, 0, 0] };
 
@@ -49,15 +48,15 @@ class Viewer {
 
   request() {
     const { field, scene, views } = this.contents, { pose } = this.navigation;
-    const photo = this.photo === null ? null : views[this.photo];
+    const photo = this.photo === null ? null : views[this.photo], shown = photo ?? field;
     return {
       pose,
       lens: this.lens,
       view: this.view,
       nearFar: photo ? photo.nearFar : nearFarBetween(pose, this.training, scene.bounded),
       background: BACKGROUNDS[this.background] ?? field.background,
-      logGain: (photo ?? field).log_gain.map((gain) => gain + this.stops * Math.LN2),
-      falloff: photo ? photo.falloff : NO_FALLOFF,
+      logGain: shown.log_gain.map((gain) => gain + this.stops * Math.LN2),
+      falloff: shown.falloff,
       crop: this.crop,
     };
   }
