@@ -193,6 +193,35 @@ def test_hdr_video_is_tone_mapped_to_srgb(
     assert off("converted") < 8 and not any("HDR" in note for note in progress.notes[1:])
 
 
+P3_FROM_BT709 = np.array([[0.8225, 0.1774, 0.0], [0.0332, 0.9669, 0.0], [0.0171, 0.0724, 0.9108]])
+
+
+@pytest.mark.parametrize(
+    ("primaries", "matrix", "from_bt709"),
+    [
+        ("bt2020", "bt2020nc", BT2020_FROM_BT709),
+        ("bt2020", "bt709", BT2020_FROM_BT709),
+        ("smpte432", "bt709", P3_FROM_BT709),
+    ],
+)
+def test_wide_gamut_video_becomes_srgb(
+    primaries: str, matrix: str, from_bt709: np.ndarray, tmp_path: Path, progress: Any
+) -> None:
+    pictures, path = coloured(panned(*np.arange(6) / 6)), tmp_path / "a.mp4"
+    for number, picture in enumerate(pictures):
+        wide = ((picture / 255) ** 2.4 @ from_bt709.T).clip(0, 1) ** (1 / 2.4)
+        cv2.imwrite(str(tmp_path / f"wide{number}.png"), np.rint(255 * wide).astype(np.uint8)[..., ::-1])
+    tags = f"setparams=color_primaries={primaries}:color_trc=bt709:colorspace={matrix}"
+    words = ["-framerate", str(FPS), "-i", str(tmp_path / "wide%d.png"), "-c:v", "libx264", "-crf", "4"]
+    words += ["-vf", f"scale=out_color_matrix={matrix[:6]}:out_range=tv,format=yuv420p,{tags}"]
+    words += ["-color_primaries", primaries, "-color_trc", "bt709", "-colorspace", matrix]
+    subprocess.run([*FFMPEG, *words, str(path)], check=True)
+    frames = taken(path, tmp_path / "out", progress)
+    shown = [np.asarray(Image.open(frame.file)).astype(int) for frame in frames]
+    off = max(float(np.abs(one - other).mean()) for one, other in zip(shown, pictures, strict=True))
+    assert off < 6 and progress.codes[0] == "ingest.gamut-mapped"
+
+
 def test_turned_hdr_video_stands_upright(tmp_path: Path, progress: Any) -> None:
     pictures = coloured(panned(*np.arange(6) / 6))
     stored, turned = hdr_clip(tmp_path / "a.mov", pictures, "arib-std-b67"), tmp_path / "b.mov"
@@ -206,7 +235,7 @@ def test_turned_hdr_video_stands_upright(tmp_path: Path, progress: Any) -> None:
 def test_an_hdr_frame_that_cannot_be_read_again_is_named(tmp_path: Path) -> None:
     path = hdr_clip(tmp_path / "a.mov", panned(*np.arange(4) / 6), "smpte2084")
     with pytest.raises(StageError) as caught:
-        list(video_frames._tone_mapped(path, [1, 7], "smpte2084"))
+        list(video_frames._filtered(path, [1, 7], video_frames.tone_mapping("smpte2084")))
     assert caught.value.code == "ingest.frame-lost" and "frame 7" in caught.value.why
 
 
