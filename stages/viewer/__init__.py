@@ -31,8 +31,9 @@ class Config(StageConfig):
 
 
 def expected_seconds(config: Config, workload: Workload) -> float:
-    """A few small renders, packing, and decoding the photos."""
-    return 5.0 + READING_SECONDS * workload.photos.megapixels * workload.photos.number / workload.cores
+    """A few small renders, packing, and decoding the test photos; those of training are in the pixel store."""
+    test_photos = workload.photos.number / workload.options["normalise"].test_every
+    return 3.0 + READING_SECONDS * workload.photos.megapixels * test_photos / workload.cores
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
