@@ -133,7 +133,7 @@ def command_run(words: Sequence[str]) -> int:
     settings = given.settings
     if given.more is not None and given.config is not None:
         what = f"--more uses the recorded options, not those of --config {given.config}"
-        raise UsageError(f"{what}; leave --config out, and give what is to change as flags")
+        raise UsageError(f"{what}; leave out --config, and give the changes as flags")
     file = {} if given.config is None else read_toml(given.config)
     if given.config is not None:  # flags win over it
         settings = arguments.with_flags(settings_from(file, f"--config {given.config}"), settings, "run", words)
@@ -154,7 +154,7 @@ def command_run(words: Sequence[str]) -> int:
     budget = _budget(given.budget, asked)
     if budget is not None and (studies := [stage for stage in stages if stage_list.is_on_request(stage)]):
         stage = studies[0]
-        what = f"{stage} is no part of a budget and has a time of its own (--{stage}.seconds)"
+        what = f"no budget covers {stage}, which has its own time limit (--{stage}.seconds)"
         raise UsageError(f"--budget and --until {stage}: {what}; run first, then `pipeline {stage} {root}`")
     with choose_display(given.common.json) as display:
         try:
@@ -187,7 +187,7 @@ def _budget(text: str | None, settings: Settings) -> float | None:
     if text is not None and settings.train.after is not None:
         raise UsageError("--budget and --more are two budgets; give one")
     if text is not None and settings.train.steps is not None:
-        what = f"--budget {text} and --train.steps {settings.train.steps}: so many steps take as long as they take"
+        what = f"--budget {text} and --train.steps {settings.train.steps}: a number of steps cannot keep a budget"
         raise UsageError(f"{what}; leave out one, or give --train.seconds")
     return None if text is None else seconds_from(text)
 

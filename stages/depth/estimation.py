@@ -161,21 +161,25 @@ def _names(photos: TrainingPhotos, numbers: list[int]) -> list[str]:
 
 def _no_pairs(photos: TrainingPhotos, left_out: Mapping[tuple[int, int], str]) -> StageError:
     reasons = sorted(set(left_out.values()))
-    why = f"of those that show the same, {' or '.join(reasons)}" if reasons else "no two show the same from two places"
+    why = (
+        f"of the overlapping ones {' or '.join(reasons)}"
+        if reasons
+        else "no two photos show the same surface from two positions"
+    )
     return StageError(
         "depth.no-pairs",
-        f"no pair of the {len(photos.views)} training photos tells any depth",
+        f"no pair of the {len(photos.views)} training photos gives depth",
         why,
-        "Take photos from places a few degrees apart, as seen from what they show.",
+        "Take photos a few degrees apart around the scene.",
     )
 
 
 def _nothing_agrees(pairs: int) -> StageError:
     return StageError(
         "depth.nothing-agrees",
-        "no depth is known anywhere",
-        f"of {pairs} pairs of photos no two agree on any point",
-        "Check the cameras, or add photos: each point must be seen by three, and show some texture.",
+        "no depth was found",
+        f"no two of {pairs} pairs of photos agree on any point",
+        "Check the cameras, or add photos: each point needs three photos and some texture.",
     )
 
 
@@ -185,11 +189,11 @@ def _say_left_out(
     if left_out:
         (one, other), why = next(iter(left_out.items()))
         first = f"{photos.views[one].name} and {photos.views[other].name}: {why}"
-        progress.note("depth.pairs-left-out", f"{len(left_out)} pairs of photos tell no depth ({first})")
+        progress.note("depth.pairs-left-out", f"{len(left_out)} pairs of photos give no depth ({first})")
     alone = [number for number in range(len(photos.views)) if len(_neighbours(number, pairs)) < 2]
     if alone:
         which = listed(_names(photos, alone), 3)
-        why = "fewer than two photos show the same from a few degrees beside them"
+        why = "fewer than two photos show the same surface from a few degrees aside"
         progress.note("depth.photos-alone", f"no depth for {len(alone)} of {len(photos.views)} photos: {why} ({which})")
 
 

@@ -90,8 +90,8 @@ def take_frames(video: Path, most: int, folder: Path, progress: Progress) -> lis
     way = frames[-1].path
     progress.note(
         "ingest.frames-taken",
-        f"{len(chosen)} of {len(frames)} frames taken: the sharpest of each step of about "
-        f"{way / (len(chosen) - 1):.0%} of the picture's width, {way:.1f} widths in all",
+        f"took {len(chosen)} of {len(frames)} frames: the sharpest of each time the image moves by about "
+        f"{way / (len(chosen) - 1):.0%} of its width; it moves by {way:.1f} widths in all",
     )
     return list(_write(video, frames, chosen, filters, folder, progress))
 
@@ -149,13 +149,13 @@ def _measure(video: Path, progress: Progress) -> list[Frame]:
             frames.append(Frame(time_s, motion.path_to(at_most(grey, FLOW_WIDTH)), sharpness(grey)))
             if len(frames) % 10 == 0:
                 share = len(frames) / announced / 2 if announced >= len(frames) else None
-                progress.update(f"looked at {len(frames)} frames of {video.name}", share)
+                progress.update(f"examined {len(frames)} frames of {video.name}", share)
     if not frames:
-        raise _undecodable("ingest.no-frame-decodes", video, "not one frame of it can be decoded")
+        raise _undecodable("ingest.no-frame-decodes", video, "none of its frames can be decoded")
     if lacks_frames(len(frames), announced):
         progress.note(
             "ingest.frames-missing",
-            f"only {len(frames)} of {announced} frames of {video.name} can be decoded: is the file whole?",
+            f"only {len(frames)} of {announced} frames of {video.name} can be decoded: is the file complete?",
         )
     return frames
 
@@ -207,7 +207,7 @@ def _write(
             height, width = picture.shape[:2]
             time_s = round(frames[number].time_s - frames[0].time_s, 4)
             yield TakenFrame(number, time_s, frames[number].sharpness, file, width, height)
-            progress.update(f"writing the {len(chosen)} frames taken", 0.5 + number / max(chosen) / 2)
+            progress.update(f"writing {len(chosen)} frames", 0.5 + number / max(chosen) / 2)
 
 
 def _as_stored(video: Path, capture: cv2.VideoCapture, chosen: Sequence[int]) -> Iterator[np.ndarray]:
@@ -279,9 +279,9 @@ def _to_srgb(video: Path, progress: Progress) -> str | None:
         return filters
     progress.note(
         "ingest.no-tone-mapping",
-        f"{what}, and this ffmpeg has no filters zscale and tonemap: its frames look flat. Convert it first by one "
-        f'that has them: ffmpeg -i {shell_quoted(video.name)} -vf "{filters},format=yuv420p" -c:v libx264 -crf 12 '
-        "sdr.mp4",
+        f"{what}, and its frames are not converted: this ffmpeg lacks the filters zscale and tonemap. Convert it with "
+        f"an ffmpeg that has them: ffmpeg -i {shell_quoted(video.name)} "
+        f'-vf "{filters},format=yuv420p" -c:v libx264 -crf 12 sdr.mp4',
     )
     return None
 
@@ -311,7 +311,7 @@ def _opened(video: Path) -> Iterator[cv2.VideoCapture]:
     cv2.utils.logging.setLogLevel(before)
     try:
         if not capture.isOpened():
-            raise _undecodable("ingest.unknown-video", video, "it is damaged, or of a kind that is not known here")
+            raise _undecodable("ingest.unknown-video", video, "it is damaged or of an unknown format")
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         yield capture
     finally:
@@ -342,7 +342,7 @@ def _undecodable(code: str, video: Path, why: str) -> StageError:
 
 
 def _lost(video: Path, number: int) -> StageError:
-    return _undecodable("ingest.frame-lost", video, f"frame {number} could be decoded before and cannot now")
+    return _undecodable("ingest.frame-lost", video, f"frame {number} cannot be decoded a second time")
 
 
 def _panoramas(video: Path) -> StageError:
@@ -359,12 +359,12 @@ def _no_way(video: Path, frames: Sequence[Frame]) -> StageError:
             "ingest.short-video",
             what,
             f"it has only {count}",
-            "Film for ten seconds and more, walking around the scene.",
+            "Film for at least ten seconds while walking around the scene.",
         )
     way = frames[-1].path
     return StageError(
         "ingest.still-video",
         what,
-        f"the camera hardly moves: in {len(frames)} frames the picture shifts by {way:.1%} of its width",
+        f"the camera hardly moves: in {len(frames)} frames the image shifts by {way:.1%} of its width",
         "Walk around the scene while filming, slowly, so that every part of it is seen from several sides.",
     )

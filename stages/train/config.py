@@ -74,8 +74,8 @@ class Config(StageConfig):
     space: Auto[Space] = Field(
         default=None,
         description=(
-            "Extent of the field: the region of interest (bounded), all of space (contracted), or normalised "
-            "device coordinates for cameras that face one way (ndc) (default: from the background and the "
+            "Space map of the field: the region of interest (bounded), all of space (contracted), or normalised "
+            "device coordinates for a forward-facing capture (ndc) (default: from the background and the "
             "cameras)."
         ),
     )

@@ -124,14 +124,15 @@ def _ignored(
 
 
 def _masked(dataset: RayDataset, ignored: "Iterable[Tensor | None]", split: "Split", progress: Progress) -> RayDataset:
+    kind = "training" if split == "train" else split
     try:
         dataset = dataset.with_masks(ignored)
     except ValueError as error:
-        why = f"{error} of the {split} photos at this size"
+        why = f"{error} of the {kind} photos at this size"
         raise StageError(ALL_MASKED, "nothing is left to train on", why, "Give a smaller --train.downscale.") from error
     progress.note(
         "train.masked",
-        f"masks leave {dataset.unmasked_count / len(dataset.pixels):.0%} of the pixels of the {split} photos",
+        f"masks leave {dataset.unmasked_count / len(dataset.pixels):.0%} of the pixels of the {kind} photos",
     )
     return dataset
 

@@ -69,7 +69,7 @@ def _with_validation_photos(target_psnr: float, scene: Scene, progress: Progress
     progress.note(
         "train.validation-photos",
         f"{validation} of {validation + left} training photos become validation photos, "
-        f"to tell when {target_psnr:g} dB are reached",
+        f"to detect when {target_psnr:g} dB are reached",
     )
     return scene
 

@@ -355,7 +355,7 @@ def test_a_run_in_seconds_keeps_to_them(tmp_path: Path, progress) -> None:
 def test_a_target_is_judged_on_validation_photos(tmp_path: Path, progress) -> None:
     inputs, _ = photographed(tmp_path, views=12, channels=4)
     result = trained(tmp_path / "train", inputs, progress, field="grid", steps=400, target_psnr=14.0)
-    assert "1 of 9 training photos become validation photos, to tell when 14 dB are reached" in progress.notes
+    assert progress.names("train.validation-photos", "1 of 9", "14 dB")
     assert result.facts["steps"] < 400 and result.facts["validation_psnr"] >= 14
     assert "14 dB reached on validation photos after" in result.line
     assert "validation" not in (inputs["normalise"] / "scene.json").read_text()
