@@ -21,11 +21,11 @@ from pipeline.engine.display import SilentDisplay
 from pipeline.engine.workspace import Workspace
 from stages.contract import Inputs
 from stages.depth import Config
-from stages.depth.estimation import depth_maps, disagreement, match_pairs
+from stages.depth.estimation import depth_maps, match_pairs
 from stages.depth.files import FOLDER
 from stages.depth.photos import one_thread_each, read_training_photos
 from stages.depth.point_cloud import fuse
-from stages.io.files import read_scene, read_tensors
+from stages.io.files import read_scene
 
 
 def figures(inputs: Inputs, side: int) -> dict[str, Any]:
@@ -44,8 +44,8 @@ def figures(inputs: Inputs, side: int) -> dict[str, Any]:
         cloud = fuse(photos, read, sum(int(np.count_nonzero(m.distance)) for m in maps), lambda share: None)
         fused = time.process_time()
         packed = sum(path.stat().st_size for path in (folder / FOLDER).iterdir())
-    points = read_tensors(inputs["normalise"] / "points.safetensors")
-    off = np.concatenate([disagreement(photos, number, depth, points) for number, depth in enumerate(maps)])
+    off = np.concatenate([photos.sparse_depths(number).disagreement(depth) for number, depth in enumerate(maps)])
+    off = off[np.isfinite(off)]
     width, height = photos.viewpoints[0].size
     return {
         "size": f"{width} × {height}",

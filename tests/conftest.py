@@ -51,6 +51,15 @@ class SilentProgress:
         """The notes of this code."""
         return [text for text, each in zip(self.notes, self.codes, strict=True) if each == code]
 
+    def names(self, code: str, *values: object) -> bool:
+        """Whether a note of this code names all the ``values``."""
+        return any(all(str(value) in text for value in values) for text in self.said(code))
+
+    def clear(self) -> None:
+        """Forget the notes."""
+        self.notes.clear()
+        self.codes.clear()
+
 
 @pytest.fixture(autouse=True)
 def cores_are_free(monkeypatch: pytest.MonkeyPatch) -> None:

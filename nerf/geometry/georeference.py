@@ -21,7 +21,7 @@ MAX_TRIMMING_ROUNDS = 10
 MIN_WIDTH = 1e-6  # of the centres' coordinates: less across their line is what rounding leaves of them
 EXACT_M = 1e-9  # off by less no position is an outlier: where all are exact, rounding is
 MAX_ERROR = 1 / 3  # of how far apart the positions are: with more they have nothing to do with the photos
-ONE_LINE = "they were taken along one line, which leaves open how the scene is turned about it"
+ONE_LINE = "the photos were taken along one line, so the rotation about that line is unknown"
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def georeference(
     Positions far off the rest are left out, round by round. Heights count where every photo has one.
     """
     if len(positions) < MIN_POSITIONS:
-        return f"{len(positions)} registered photos have a GPS position, {MIN_POSITIONS} are needed"
+        return f"{len(positions)} registered photos have a GPS position, and it takes {MIN_POSITIONS}"
     latitude, longitude = np.array([position[:2] for position in positions], float).T
     heights = [position[2] for position in positions]
     altitude = np.zeros(len(positions)) if None in heights else np.array(heights, float)
@@ -86,7 +86,7 @@ def georeference(
     enu = (earth - earth[middle]) @ east_north_up(*origin[:2]).T
     spread = float(np.linalg.norm(enu - np.median(enu, axis=0), axis=1).max())
     if spread < GPS_ERROR_M:
-        return f"their positions lie within {spread:.0f} m, and GPS errs by up to {GPS_ERROR_M:.0f} m"
+        return f"the positions lie within {spread:.0f} m, and GPS errs by up to {GPS_ERROR_M:.0f} m"
     width = _across(centres)
     if _across(enu) < GPS_ERROR_M / 2 or not width * np.sqrt(len(centres)) > MIN_WIDTH * np.abs(centres).max():
         return ONE_LINE
@@ -96,7 +96,7 @@ def georeference(
     off = np.linalg.norm(fitted.points(centres) - enu, axis=1)
     error = float(np.median(off[kept]))
     if error > MAX_ERROR * spread:
-        return f"their GPS positions, {spread:.0f} m apart, are {error:.0f} m off the reconstruction"
+        return f"the GPS positions span {spread:.0f} m and are {error:.0f} m off the reconstruction"
     return Georeference(fitted, origin, int(kept.sum()), error)
 
 

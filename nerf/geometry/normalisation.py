@@ -71,7 +71,7 @@ def normalise(
         upright = replace(upright, opaque=None)
     region = given or find_region(upright, capture_type)
     if not region.half >= MIN_HALF_SIZE:
-        raise ValueError(f"it is {region.half:.2g} units large, and {MIN_HALF_SIZE:g} is the least")
+        raise ValueError(f"it is {region.half:.2g} units large, and it needs at least {MIN_HALF_SIZE:g}")
     scale = REGION_HALF_SIZE / region.half
     centre = middle + rotation.T @ region.centre
     scene = upright.in_frame(np.eye(3), region.centre, scale)
@@ -96,8 +96,8 @@ def _check_extent(sfm: Reconstruction, middle: Float[np.ndarray, "3"]) -> None:
     extent, distance = np.abs(places - middle).max(), np.abs(places).max()
     if 0 < extent <= ONE_PLACE * distance:
         raise ValueError(
-            f"all its places are within {extent:.2g} units, {distance:.2g} from the origin: one place, as far as "
-            "numbers of 16 digits can tell"
+            f"its cameras and points lie within {extent:.2g} units, {distance:.2g} from the origin: float64 cannot "
+            "tell them apart"
         )
 
 

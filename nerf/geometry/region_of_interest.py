@@ -79,7 +79,7 @@ def find_region(scene: Reconstruction, capture_type: CaptureType) -> Region:
     """
     cube = _ungrown(scene, capture_type)
     if not cube.half > 0:
-        raise ValueError("all cameras stand in one place and no point is known")
+        raise ValueError("all cameras have the same position, and there are no points")
     return _grown(cube, scene)
 
 

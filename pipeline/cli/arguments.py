@@ -197,7 +197,7 @@ def _chosen_or_given(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] |
         if words == ["None"]:
             return None
         if spec.choices and words[0] not in spec.choices:
-            raise ValueError(f"{words[0]!r} is none of {', '.join(spec.choices)}")
+            raise ValueError(f"{words[0]!r} is not one of {', '.join(spec.choices)}")
         return spec.instance_from_str(words)
 
     return PrimitiveConstructorSpec(

@@ -133,7 +133,7 @@ def command_run(words: Sequence[str]) -> int:
     settings = given.settings
     if given.more is not None and given.config is not None:
         what = f"--more uses the recorded options, not those of --config {given.config}"
-        raise UsageError(f"{what}; leave --config out, and give what is to change as flags")
+        raise UsageError(f"{what}; leave out --config, and give the changes as flags")
     file = {} if given.config is None else read_toml(given.config)
     if given.config is not None:  # flags win over it
         settings = arguments.with_flags(settings_from(file, f"--config {given.config}"), settings, "run", words)
@@ -147,14 +147,16 @@ def command_run(words: Sequence[str]) -> int:
         cameras = cameras or recorded.ingest.cameras
     asked = _matching_exposure(with_effects(_more(settings, given.more, root), given.effect), given.match_exposure)
     asked = _keeping_studies(asked, root, words, file)
-    stages = stage_list.up_to(_known_stage(given.until or list(stage_list.STAGES)[-1], "--until"))
+    stages = stage_list.up_to(_known_stage(given.until or list(stage_list.STAGES)[-1], "--until"), dict(asked))
     force = frozenset[str]()
     if given.from_ is not None:
         force = frozenset(stages[stages.index(_known_stage(given.from_, "--from", stages)) :])
     budget = _budget(given.budget, asked)
     if budget is not None and (studies := [stage for stage in stages if stage_list.is_on_request(stage)]):
         stage = studies[0]
-        what = f"{stage} is no part of a budget and has a time of its own (--{stage}.seconds)"
+        what = f"no budget covers {stage}, which has its own time limit (--{stage}.seconds)"
+        if stage != given.until:
+            raise UsageError(f"--budget and --train.depth: {what}; give --train.seconds in place of --budget")
         raise UsageError(f"--budget and --until {stage}: {what}; run first, then `pipeline {stage} {root}`")
     with choose_display(given.common.json) as display:
         try:
@@ -187,7 +189,7 @@ def _budget(text: str | None, settings: Settings) -> float | None:
     if text is not None and settings.train.after is not None:
         raise UsageError("--budget and --more are two budgets; give one")
     if text is not None and settings.train.steps is not None:
-        what = f"--budget {text} and --train.steps {settings.train.steps}: so many steps take as long as they take"
+        what = f"--budget {text} and --train.steps {settings.train.steps}: a number of steps cannot keep a budget"
         raise UsageError(f"{what}; leave out one, or give --train.seconds")
     return None if text is None else seconds_from(text)
 
@@ -276,7 +278,7 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
     if given.cameras is not None:
         update = {"cameras": given.cameras.absolute()}
         settings = settings.model_copy(update={"render": settings.render.model_copy(update=update)})
-    stages = stage_list.needed_for(stage)
+    stages = stage_list.needed_for(stage, dict(settings))
     shown = [name for name in workspace.read_run().keys if stage_list.is_summary(name) and name not in stages]
     stages = [*stages, *shown]
     with choose_display(given.common.json) as display:
@@ -379,7 +381,8 @@ def command_demo(words: Sequence[str]) -> int:
         display.end("photos", line, seconds, cached=seconds == 0)
         settings = with_source(asked, photos, None)
         budgeted = (budget, seconds)
-        code = _run_stages(root, settings, stage_list.usual(), given.common, display, new_budget=budgeted)
+        stages = stage_list.up_to(list(stage_list.STAGES)[-1], dict(settings))
+        code = _run_stages(root, settings, stages, given.common, display, new_budget=budgeted)
         started = time.monotonic()
         display.begin("truth")
         *notes, last = demo.truth_lines(root / "output", photos)

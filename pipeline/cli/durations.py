@@ -19,5 +19,5 @@ def seconds_from(text: str) -> float:
     hours, minutes, seconds = (float(part or 0) for part in found.groups())
     total = 3600 * hours + 60 * minutes + seconds
     if total == 0:
-        raise UsageError(f"{text!r} is no time at all; write a duration like 90s, 10m or 1h30m")
+        raise UsageError(f"{text!r} is not above 0; write a duration like 90s, 10m or 1h30m")
     return total

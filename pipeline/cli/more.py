@@ -44,7 +44,7 @@ def with_more(settings: Settings, workspace: Workspace, text: str) -> Settings:
 def _budget(text: str) -> dict[str, Any]:
     if counted := _STEPS.fullmatch(text.strip()):
         if not int(counted[1]):
-            raise UsageError("--more 0steps is no training at all")
+            raise UsageError("--more needs at least one step")
         return {"more_steps": int(counted[1]), "more_seconds": None}
     return {"more_steps": None, "more_seconds": seconds_from(text)}
 

@@ -38,7 +38,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise UsageError(f"--config {path} is not TOML: {error}") from error
     for (stage, option), word in WORDS_ALONE.items():
         if isinstance(table := values.get(stage), dict) and option in table:
-            raise UsageError(f"--config {path}: {stage}.{option} is no option of a file; give {word} instead")
+            raise UsageError(f"--config {path}: a file cannot set {stage}.{option}; give {word} instead")
     return values
 
 
@@ -137,10 +137,10 @@ def check_workspace(root: Path, photos: Path) -> None:
     where the photos are a result of it, which a run takes out of its ``output/`` before it reads them."""
     places = [place for place in (photos, photos / "images") if not (place / RUN_FILE).is_file()]
     if photos.is_dir() and os.path.realpath(root) in map(os.path.realpath, places):
-        better = f"leave -o out, which writes to {default_workspace(photos)}, or name another"
+        better = f"leave out -o to write to {default_workspace(photos)}, or give another folder"
         raise UsageError(f"-o {root}: that is a folder of photos; {better}")
     if is_result(photos, root):
-        what = f"{photos} is a result of that workspace, and makes way for those of the new run"
+        what = f"{photos} is a result in that workspace, which the new run would replace"
         raise UsageError(f"-o {root}: {what}; give another folder with -o")
 
 
@@ -153,5 +153,5 @@ def check_same_photos(workspace: Workspace, photos: Path) -> None:
     before, now = photo_set(Path(recorded)), photo_set(photos)
     if os.path.realpath(before) != os.path.realpath(now):
         name = workspace.root.name
-        ways = f"-o another.nerf keeps them apart, -o {name} goes on in this one with the new photos"
+        ways = f"give -o another.nerf to keep them apart, or -o {name} to use it for the new photos"
         raise UsageError(f"{name} was made from {before}, not from {now}; {ways}")

@@ -27,13 +27,13 @@ def heed_signals() -> None:
 
 def go_on(words: Sequence[str]) -> str:
     """What takes up again the work of a command line that was stopped."""
-    way = "the same command goes on"
+    way = "the same command continues"
     if words[0] in ("run", "resume"):  # what was asked for is recorded before any stage begins
-        way = "`pipeline resume WORKSPACE` goes on"
+        way = "`pipeline resume WORKSPACE` continues"
     elif "--force" in words:
-        way = "the same command begins anew"
+        way = "the same command starts over"
     elif "--replan" in words:
-        way = "the same command without --replan goes on"
+        way = "the same command without --replan continues"
     return f"Finished stages are kept; {way}."
 
 

@@ -39,7 +39,7 @@ def photograph(folder: Path, progress: Progress) -> tuple[str, float]:
     folder holds anything else, or cannot be written.
     """
     truth = demo_truth(LENS, PHOTOS, SEED)
-    line = f"{PHOTOS} photos {LENS.width}×{LENS.height} of a still life, every camera and surface known"
+    line = f"{PHOTOS} photos {LENS.width}×{LENS.height} of a still life with known cameras and surfaces"
     try:
         _refuse_strangers(folder, truth)
         if _is_done(folder, truth):
@@ -47,7 +47,7 @@ def photograph(folder: Path, progress: Progress) -> tuple[str, float]:
         started = time.monotonic()
         write_photos(folder, truth, progress)
     except OSError as error:
-        raise _cannot_write(folder, error.strerror or str(error), "a folder with room that you may write to") from error
+        raise _cannot_write(folder, error.strerror or str(error), "a writable folder with free space") from error
     return line, time.monotonic() - started
 
 
@@ -110,7 +110,7 @@ def _is_done(folder: Path, truth: Truth) -> bool:
 def _refuse_strangers(folder: Path, truth: Truth) -> None:
     others = sorted(p.name for p in folder.iterdir() if p.name not in truth.poses) if folder.is_dir() else []
     if others:
-        raise _cannot_write(folder, f"it holds {others[0]}, which is not one of them", "an empty folder")
+        raise _cannot_write(folder, f"it holds {others[0]}, which is none of the demo's photos", "an empty folder")
 
 
 def _cannot_write(folder: Path, why: str, better: str) -> StageError:

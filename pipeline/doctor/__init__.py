@@ -26,7 +26,7 @@ def examine(folder: Path, selftest: bool, bench: bool) -> int:
     print(f"python {platform.python_version()} on {platform.platform()}")
     found = machine.versions(PACKAGES)
     print("\n".join(f"  {name:<32} {version}" for name, version in found.items()))
-    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none that torch can use"
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none usable by torch"
     free_gb = machine.free_bytes(folder) / 2**30
     print(f"cores {processors()} · torch threads {torch.get_num_threads()} · GPU {gpu} · {free_gb:.1f} GB free")
     problems = [f"{name} is not installed" for name, version in found.items() if version == "missing"]
@@ -39,7 +39,7 @@ def examine(folder: Path, selftest: bool, bench: bool) -> int:
         problems += numerical_matrix(device.type)
     if bench:
         print("\n".join(bench_lines(device)))
-    print("\n".join(f"problem: {problem}" for problem in problems) or "all well")
+    print("\n".join(f"problem: {problem}" for problem in problems) or "no problem found")
     return 1 if problems else 0
 
 

@@ -35,7 +35,7 @@ def bench_lines(device: torch.device) -> list[str]:
     words = f"{count} cores at once" if device.type == "cpu" else "the GPU"
     lines = [f"rates of {words}, float32" + (", per core and in all" if count > 1 else "")]
     for width, rate in products.items():
-        lines.append(_line(f"matrix products (8192, {width}) × ({width}, {width})", rate / 1e9, count, "GFLOP/s"))
+        lines.append(_line(f"matrix multiplication (8192, {width}) × ({width}, {width})", rate / 1e9, count, "GFLOP/s"))
     for name, rate in reads.items():
         lines.append(_line(f"random reads of 16 bytes, table of {name} rows", rate / 1e6, count, "million/s"))
     size = bytes_in_words(copied_bytes(device))
@@ -51,7 +51,7 @@ def _line(name: str, rate: float, count: int, unit: str) -> str:
 
 def _meaning(products: dict[int, float], reads: float, copied: float, count: int) -> list[str]:
     """What training can reach here at most: the work of a ray that nothing can save, at these rates."""
-    lines = ["at these rates, with nothing else to do and no core waiting, training would reach"]
+    lines = ["upper bounds of the training speed at these rates"]
     for space, densities in DENSITIES.items():
         work = grid_work(space, densities)
         most = count / Rates(products[64], reads, copied).seconds(work)

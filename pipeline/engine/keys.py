@@ -86,7 +86,7 @@ class ContentIndex:
             return self.sha256(path)
         if not path.is_dir():
             raise StageError(
-                "pipeline.no-such-file", f"{path} does not exist", "a setting names it", "Check the path and run again."
+                "pipeline.no-such-file", f"{path} does not exist", "an option names it", "Check the path and run again."
             )
         try:
             return self.of_files(path, camera_files(path))

@@ -91,9 +91,9 @@ def read(folder: Path) -> Manifest:
         raise BadManifest(f"{folder / NAME} cannot be used ({error})") from error
     for name, entry in {**manifest.outputs, **manifest.records}.items():
         if not (isinstance(entry.get("size"), int) and isinstance(entry.get("sha256"), str)):
-            raise BadManifest(f"{folder / NAME} does not tell size and sha256 of {name[:40]!r}")
+            raise BadManifest(f"{folder / NAME} lacks size and sha256 of {name[:40]!r}")
     if manifest.outputs_digest != outputs_digest(manifest.outputs):
-        raise BadManifest(f"{folder / NAME} contradicts itself: its digest is not that of its outputs")
+        raise BadManifest(f"{folder / NAME} contradicts itself: its digest does not match its outputs")
     return manifest
 
 
@@ -106,7 +106,7 @@ def sealed(value: dict[str, Any]) -> dict[str, Any]:
 def unsealed(value: dict[str, Any]) -> dict[str, Any]:
     """What :func:`sealed` was given. Raises ValueError where it has changed since."""
     if not isinstance(value, dict) or SEAL not in value:
-        raise ValueError("it has no seal")
+        raise ValueError("it has no checksum")
     plain = {name: entry for name, entry in value.items() if name != SEAL}
     if digest(plain) != value[SEAL]:
         raise ValueError("it has changed since it was written")
@@ -122,6 +122,6 @@ def check_outputs(folder: Path, manifest: Manifest, deep: bool = False) -> None:
         if not path.is_file():
             raise BadManifest(f"{path} is missing")
         if path.stat().st_size != entry["size"]:
-            raise BadManifest(f"{path} has {path.stat().st_size} bytes, its manifest says {entry['size']}")
+            raise BadManifest(f"{path} has {path.stat().st_size} bytes, but its manifest says {entry['size']}")
         if deep and file_sha256(path) != entry["sha256"]:
             raise BadManifest(f"{path} has changed since it was written")

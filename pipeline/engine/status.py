@@ -11,7 +11,7 @@ from pipeline.engine.manifests import BadManifest, Manifest
 from pipeline.engine.runner import Runner
 from pipeline.engine.stage_list import STAGES, command_that_makes
 from pipeline.engine.workspace import Workspace
-from stages.contract import KEY_LENGTH, Options, StageError, declared
+from stages.contract import KEY_LENGTH, Options, StageError, declared, inputs_of
 
 
 @dataclass(frozen=True)
@@ -73,25 +73,25 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
 
 def _why_unplanned(runner: Runner, stage: str, last: Manifest) -> str:
     """Why a stage whose inputs are there has not the result it needs, while its open options are not chosen yet."""
-    inputs = {name: runner.done[name].outputs_digest for name in STAGES[stage].INPUTS}
-    return "; ".join(_other_inputs(inputs, last)) or "what its options leave open is chosen again"
+    inputs = {name: runner.done[name].outputs_digest for name in inputs_of(STAGES[stage], runner.options[stage])}
+    return "; ".join(_other_inputs(inputs, last)) or "its automatic options are chosen again"
 
 
 def _other_inputs(now: dict[str, str], last: Manifest) -> list[str]:
     changed = (name for name in sorted({*now, *last.inputs}) if now.get(name) != last.inputs.get(name))
-    return [f"{name} gives another result" for name in changed]
+    return [f"{name} has another result" for name in changed]
 
 
 def differences(job: Job, last: Manifest) -> list[str]:
     """Which part of the key changed between the last result and now."""
     found = []
     if last.version != job.module.VERSION:
-        found.append(f"the stage itself changed (version {last.version} → {job.module.VERSION})")
+        found.append(f"the program has changed (version {last.version} → {job.module.VERSION} of this stage)")
     now: dict[str, Any] = job.config.model_dump(mode="json", exclude=set(declared(job.module, "NOT_HASHED")))
     found += [f"{job.stage}.{change}" for change in _changes(job.config, now, last.config)]
     found += _other_inputs(job.inputs, last)
     if not found and last.key != job.key:
-        found.append("the content of a file that its settings name changed")
+        found.append("a file named in its options has changed")
     return found
 
 

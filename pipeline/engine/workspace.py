@@ -88,7 +88,7 @@ class Workspace:
         self._lock.release()
 
     def _cannot_write(self, error: OSError) -> StageError:
-        hint = "Make room there, or give a folder you may write to with -o."
+        hint = "Make room there, or give a writable folder with -o."
         return StageError("pipeline.cannot-write", f"cannot write to {self.root}", error.strerror or str(error), hint)
 
     def _holder(self) -> str:
@@ -324,8 +324,8 @@ def _refuse_links(root: Path) -> None:
             raise StageError(
                 "pipeline.link",
                 f"{path} is a link",
-                "results are written and removed there, and a link may lead anywhere",
-                "Put the folder itself in its place. The whole workspace may be a link.",
+                "a stage writes and removes files there, and a link may lead anywhere",
+                "Replace the link with the folder itself. Only the whole workspace may be a link.",
             )
 
 

@@ -126,7 +126,7 @@ class Account(BaseModel):
         if least <= self.left:
             return None
         left = f"{duration(max(0.0, self.left))} of {duration(self.total)} are left"
-        return f"{left}, the smallest of all that is to come takes about {duration(least)}"
+        return f"{left}, and the remaining stages need at least about {duration(least)}"
 
     def end(self, stage: str, seconds: float) -> None:
         """Note that an attempt at ``stage`` ended, well or not, after ``seconds``."""

@@ -125,11 +125,13 @@ def budget_message(stages: Stages, budget: Left, times: Times, reading: float, e
     least, most = min_total(stages, times, reading), max_total(stages, times, total)
     given = f"budget {duration(total)}" + (f" and {rough_duration(extra)} on top" if extra else "")
     if least > left and left < total:
-        needed = f"about {rough_duration(least)} is needed: give a larger --budget, or all is made as small as can be"
-        return f"{given}, {duration(max(0.0, left))} of it left by what was spent before; {needed}"
+        needed = (
+            f"it takes at least about {rough_duration(least)}: give a larger --budget, or every stage does its minimum"
+        )
+        return f"{given}, of which {duration(max(0.0, left))} are left; {needed}"
     if least > left:
-        soonest = f"about {rough_duration(least)} is the least that would do"
-        return f"{given}, too short for these photos: {soonest}; all is made as small as can be"
+        soonest = f"it takes at least about {rough_duration(least)}"
+        return f"{given}, too short for these photos: {soonest}; every stage does its minimum"
     finish = _clock(min(left, most) + extra)
     # Others have no use for more than a share, and may well be done sooner.
     uses_all = any(

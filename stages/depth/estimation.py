@@ -15,7 +15,7 @@ import torch
 
 from nerf.runtime.parallel import in_order, take_over_cores, workers
 from stages.contract import Inputs, Progress, StageError, StageResult, listed
-from stages.depth.consistency import Candidate, DepthMap, agreed
+from stages.depth.consistency import Candidate, agreed, plausible
 from stages.depth.files import FOLDER, depth_map_file, read_depth_map, write_depth_map
 from stages.depth.matching import MAX_VOLUME_BYTES, candidates, cost_volume_bytes
 from stages.depth.photos import KEPT_PHOTOS, TrainingPhotos, one_thread_each, read_training_photos
@@ -23,7 +23,7 @@ from stages.depth.point_cloud import ReadMap, fuse, ply_bytes
 from stages.depth.rectification import Rectified
 from stages.hardware.memory import check_memory
 from stages.io.amounts import short_count
-from stages.io.files import read_tensors, write_durably, write_json
+from stages.io.files import write_durably, write_json
 
 if TYPE_CHECKING:
     from stages.depth import Config
@@ -49,7 +49,7 @@ def estimate_depth(config: "Config", inputs: Inputs, folder: Path, progress: Pro
         match_pairs(photos, pairs, folder, progress)
         progress.update("fusing points", MATCHING)
         read = depth_maps(photos, folder)
-        facts, known = _facts(photos, read, read_tensors(inputs["normalise"] / "points.safetensors"))
+        facts, known = _facts(photos, read)
         if not known:
             raise _nothing_agrees(len(pairs))
         cloud = fuse(
@@ -136,6 +136,7 @@ def _write_agreed(photos: TrainingPhotos, number: int, neighbours: list[int], fo
     width, height = photos.viewpoints[number].size
     files = [_side_file(folder, number, one) for one in neighbours]
     depth = agreed([read_side(file, (height, width)) for file in files], (height, width))
+    depth = plausible(depth, photos.sparse_depths(number))
     write_depth_map(depth_map_file(folder, photos.views[number].file), depth)
     for file in files:
         file.unlink()
@@ -160,21 +161,25 @@ def _names(photos: TrainingPhotos, numbers: list[int]) -> list[str]:
 
 def _no_pairs(photos: TrainingPhotos, left_out: Mapping[tuple[int, int], str]) -> StageError:
     reasons = sorted(set(left_out.values()))
-    why = f"of those that show the same, {' or '.join(reasons)}" if reasons else "no two show the same from two places"
+    why = (
+        f"of the overlapping ones {' or '.join(reasons)}"
+        if reasons
+        else "no two photos show the same surface from two positions"
+    )
     return StageError(
         "depth.no-pairs",
-        f"no pair of the {len(photos.views)} training photos tells any depth",
+        f"no pair of the {len(photos.views)} training photos gives depth",
         why,
-        "Take photos from places a few degrees apart, as seen from what they show.",
+        "Take photos a few degrees apart around the scene.",
     )
 
 
 def _nothing_agrees(pairs: int) -> StageError:
     return StageError(
         "depth.nothing-agrees",
-        "no depth is known anywhere",
-        f"of {pairs} pairs of photos no two agree on any point",
-        "Check the cameras, or add photos: each point must be seen by three, and show some texture.",
+        "no depth was found",
+        f"no two of {pairs} pairs of photos agree on any point",
+        "Check the cameras, or add photos: each point needs three photos and some texture.",
     )
 
 
@@ -184,25 +189,26 @@ def _say_left_out(
     if left_out:
         (one, other), why = next(iter(left_out.items()))
         first = f"{photos.views[one].name} and {photos.views[other].name}: {why}"
-        progress.note("depth.pairs-left-out", f"{len(left_out)} pairs of photos tell no depth ({first})")
+        progress.note("depth.pairs-left-out", f"{len(left_out)} pairs of photos give no depth ({first})")
     alone = [number for number in range(len(photos.views)) if len(_neighbours(number, pairs)) < 2]
     if alone:
         which = listed(_names(photos, alone), 3)
-        why = "fewer than two photos show the same from a few degrees beside them"
+        why = "fewer than two photos show the same surface from a few degrees aside"
         progress.note("depth.photos-alone", f"no depth for {len(alone)} of {len(photos.views)} photos: {why} ({which})")
 
 
-def _facts(photos: TrainingPhotos, read: ReadMap, points: Mapping[str, np.ndarray]) -> tuple[dict[str, Any], int]:
+def _facts(photos: TrainingPhotos, read: ReadMap) -> tuple[dict[str, Any], int]:
     """Size, coverage, and how far off the sparse points are, which are measured otherwise; and how many pixels of all
     depth maps are known."""
     coverage, sigma, off, known = dict[str, float](), [], [], 0
     for number, view in enumerate(photos.views):
         depth = read(number)
         coverage[view.name] = round(depth.coverage, 4)
-        off.append(disagreement(photos, number, depth, points))
+        off.append(photos.sparse_depths(number).disagreement(depth))
         sigma.append(float(np.median(depth.sigma[depth.distance > 0])) if depth.coverage else np.nan)
         known += int(np.count_nonzero(depth.distance))
     off = np.concatenate(off)
+    off = off[np.isfinite(off)]
     facts = {
         "photos": len(photos.views),
         "size": list(photos.viewpoints[0].size),
@@ -213,17 +219,6 @@ def _facts(photos: TrainingPhotos, read: ReadMap, points: Mapping[str, np.ndarra
         "coverage_by_photo": coverage,
     }
     return facts, known
-
-
-def disagreement(photos: TrainingPhotos, number: int, depth: DepthMap, points: Mapping[str, np.ndarray]) -> np.ndarray:
-    """|distance / that of the sparse point - 1| at each sparse point that a photo sees and whose pixel has a depth."""
-    viewpoint = photos.viewpoints[number]
-    seen = np.flatnonzero(points["view"] == photos.scene.indices_of("train")[number])
-    scale = np.array(viewpoint.size) / [viewpoint.camera.width, viewpoint.camera.height]
-    column, row = np.clip((points["xy"][seen] * scale).astype(int), 0, np.array(viewpoint.size) - 1).T
-    true = np.linalg.norm(points["xyz"][points["point"][seen]] - viewpoint.scene_from_camera[:, 3], axis=1)
-    found = depth.distance[row, column]
-    return np.abs(found / np.maximum(true, 1e-30) - 1)[found > 0]
 
 
 def _line(photos: TrainingPhotos, facts: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ between the two rays to it; the sum ranks the photos. Neighbours of a photo shou
 the one cannot see, hidden behind an edge, the others cannot see either, and no depth is kept that only one pair tells.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -47,7 +47,7 @@ class Tracks(NamedTuple):
         return (sees @ sees.T).tocsr()
 
 
-def tracks_of(scene: Scene, views: Sequence[int], points: dict[str, np.ndarray]) -> Tracks:
+def tracks_of(scene: Scene, views: Sequence[int], points: Mapping[str, np.ndarray]) -> Tracks:
     """What the ``views`` (indices into the scene's) see of the sparse points; of a grid of points in the region of
     interest where there are no tracks, as with imported cameras."""
     number = np.full(len(scene.views), -1)

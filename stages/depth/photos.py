@@ -1,6 +1,6 @@
 """The training photos of a scene as depth maps are made of them: viewpoints, pixels, and which pairs are matched."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 
 from nerf.geometry.scene import Scene, View
 from stages.contract import Inputs, StageError
+from stages.depth.consistency import SparseDepths
 from stages.depth.matching import even_contrast
 from stages.depth.neighbours import Tracks, choose_pairs, depth_range, tracks_of
 from stages.depth.rectification import CannotRectify, Pixels, Rectified, Viewpoint, rectify
@@ -40,8 +41,12 @@ class TrainingPhotos:
 
     ingest: Path
     scene: Scene
-    tracks: Tracks
+    points: Mapping[str, np.ndarray]
     downscale: float
+
+    @cached_property
+    def tracks(self) -> Tracks:
+        return tracks_of(self.scene, self.scene.indices_of("train"), self.points)
 
     @cached_property
     def views(self) -> tuple[View, ...]:
@@ -87,6 +92,15 @@ class TrainingPhotos:
         width, height = self.viewpoints[number].size
         return np.ascontiguousarray(load_pixels(self.ingest / self.views[number].file, width, height)[..., :3])
 
+    def sparse_depths(self, number: int) -> SparseDepths:
+        """The sparse points that a photo shows."""
+        viewpoint = self.viewpoints[number]
+        seen = np.flatnonzero(self.points["view"] == self.scene.indices_of("train")[number])
+        scale = np.array(viewpoint.size) / [viewpoint.camera.width, viewpoint.camera.height]
+        column, row = np.clip((self.points["xy"][seen] * scale).astype(int), 0, np.array(viewpoint.size) - 1).T
+        towards = self.points["xyz"][self.points["point"][seen]] - viewpoint.scene_from_camera[:, 3]
+        return SparseDepths(row, column, np.linalg.norm(towards, axis=1))
+
     def rectified(self, one: int, other: int) -> Rectified:
         """The rectified pair. Raises CannotRectify."""
         depths = depth_range(self.poses, self.tracks, (one, other), self.views)
@@ -111,10 +125,9 @@ class TrainingPhotos:
 def read_training_photos(inputs: Inputs, downscale: float) -> TrainingPhotos:
     """The training photos of a scene. Raises StageError where a pose is not finite."""
     scene = read_scene(inputs["normalise"])
-    views = scene.indices_of("train")
-    for index in views:
+    for index in scene.indices_of("train"):
         if not np.isfinite(scene.views[index].scene_from_camera).all():
             what = f"the pose of {scene.views[index].name} is not finite"
             raise StageError("depth.pose-not-finite", what, "scene.json holds NaN or infinity", "Run normalise again.")
-    tracks = tracks_of(scene, views, read_tensors(inputs["normalise"] / "points.safetensors"))
-    return TrainingPhotos(inputs["ingest"], scene, tracks, downscale)
+    points = read_tensors(inputs["normalise"] / "points.safetensors")
+    return TrainingPhotos(inputs["ingest"], scene, points, downscale)

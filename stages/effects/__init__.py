@@ -101,7 +101,7 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
         return config.model_copy(update={"pilots": 0})
     from stages.effects.pilots import expected_seconds
 
-    progress.update("trying how long a pilot would take")
+    progress.update("timing a pilot")
     took, fitting = expected_seconds(read_scene(inputs["normalise"]), config.pilot_steps)
     pilots = min(MAX_PILOTS, int(config.seconds / took))
     more = (config.seconds - pilots * took) / (fitting - took)

@@ -70,7 +70,7 @@ def sample_photos(ingest: Path, scene: Scene, points: Mapping[str, np.ndarray], 
     try:
         for number, future in enumerate([pool.submit(look, number) for number in range(len(views))]):
             seen[of_view[number]] = future.result()
-            progress.update(f"looked at {number + 1} of {len(views)} photos", (number + 1) / len(views))
+            progress.update(f"read colours of {number + 1} of {len(views)} photos", (number + 1) / len(views))
     finally:
         pool.shutdown(cancel_futures=True)
     both = replace(both, colour=seen[:, :3], saturated=seen[:, 3] > 0, texture=seen[:, 4])

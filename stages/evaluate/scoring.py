@@ -83,7 +83,7 @@ def score(scorer: "Scorer", folder: Path, progress: Progress) -> Scores:
     views = [view for view in test if (mask := scorer.mask(view)) is None or mask.any()]
     notes = list[Note]()
     if masked := len(test) - len(views):
-        what = f"masks leave nothing to compare of {photos_in_words(masked)} at this size"
+        what = f"masks leave nothing of {photos_in_words(masked)} to score at this size"
         notes.append(Note("evaluate.masked", what))
         progress.note(*notes[-1])
     if not views:

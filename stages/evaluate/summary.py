@@ -14,7 +14,7 @@ MIN_DIFFERENCE_DB = 0.5  # between two scores of right halves, to be mentioned
 # Why nothing is measured, by whether there are test photos at all.
 UNMEASURED = {False: "no photo was kept for testing", True: "masks leave nothing of the test photos"}
 NO_LPIPS = Note(
-    "evaluate.no-lpips", "LPIPS is not computed: no package in use ships its weights and nothing is downloaded"
+    "evaluate.no-lpips", "LPIPS is not computed: no installed package has its weights, and nothing is downloaded"
 )
 
 
@@ -56,18 +56,18 @@ def verdict(metrics: dict[str, Any]) -> str:
     if value is None:
         return f"Not measured: {UNMEASURED[metrics['photos_test'] > 0]}."
     figures = f"{value:.1f} dB on {_unseen(metrics)}" + ("" if similarity is None else f", SSIM {similarity:.2f}")
-    gain = f"{value - nearest:.1f} dB better than the nearest photo"
+    gain = f"{value - nearest:.1f} dB better than the nearest training view"
     if value <= mean:
-        what = f"Unusable: {value:.1f} dB is no better than the mean of the training photos ({mean:.1f} dB)"
-        what += "; look at the camera layout, then train longer"
+        what = f"Unusable: {value:.1f} dB is no better than the mean training image ({mean:.1f} dB)"
+        what += "; check the cameras, then train longer"
     elif value <= nearest:
-        what = f"Worse than showing the nearest photo ({value:.1f} against {nearest:.1f} dB): train longer"
+        what = f"Worse than the nearest training view ({value:.1f} against {nearest:.1f} dB): train longer"
     elif value < 22 or _below(similarity, 0.7):
-        what = f"Better than the nearest training photo by {value - nearest:.1f} dB but soft: {figures}"
+        what = f"Better than the nearest training view by {value - nearest:.1f} dB but soft: {figures}"
     elif value < 27 or _below(similarity, 0.85):
         what = f"Good, with fine detail missing: {figures}, {gain}"
     elif max(metrics["scored_size"]) < MIN_TRUSTED_WIDTH * min(max(metrics["photo_size"]), MAX_SCORED_SIDE):
-        what = f"Sharp as a small image, finer detail was not looked at: {figures}, {gain}"
+        what = f"Sharp as a small image, with finer detail unscored: {figures}, {gain}"
     elif metrics["photos_scored"] < MIN_FOR_INTERVAL:
         what = f"Sharp, as far as {photos_in_words(metrics['photos_scored'])} can tell: {figures}, {gain}"
     else:
@@ -76,14 +76,16 @@ def verdict(metrics: dict[str, Any]) -> str:
 
 
 def line_of(metrics: dict[str, Any]) -> str:
-    """21.4 ± 0.4 dB, SSIM 0.61 · nearest photo 14.2 dB, mean image 12.9 dB · 25% of each of 11 photos at 1600 × 1067
-    (trained at 800 × 534)."""
+    """21.4 ± 0.4 dB, SSIM 0.61 · nearest training view 14.2 dB, mean image 12.9 dB · 25% of each of 11 photos at
+    1600 × 1067 (trained at 800 × 534)."""
     if metrics["psnr"] is None:
         return f"nothing measured: {UNMEASURED[metrics['photos_test'] > 0]}"
     interval = metrics["psnr_interval"]
     deviation = f" ± {(interval[1] - interval[0]) / 2:.1f}" if interval else ""
     similarity = "" if metrics["ssim"] is None else f", SSIM {metrics['ssim']:.2f}"
-    trivial = f"nearest photo {metrics['psnr_nearest_view']:.1f} dB, mean image {metrics['psnr_mean_image']:.1f} dB"
+    trivial = (
+        f"nearest training view {metrics['psnr_nearest_view']:.1f} dB, mean image {metrics['psnr_mean_image']:.1f} dB"
+    )
     return f"{metrics['psnr']:.1f}{deviation} dB{similarity}{_right_halves(metrics)} · {trivial} · {scored_on(metrics)}"
 
 
@@ -95,9 +97,9 @@ def scored_on(metrics: dict[str, Any]) -> str:
 
 
 def _unseen(metrics: dict[str, Any]) -> str:
-    """25% of each of 11 unseen photos at 1600 × 1067 (trained at 800 × 534)."""
+    """25% of each of 11 test photos at 1600 × 1067 (trained at 800 × 534)."""
     scored = metrics["photos_scored"]
-    return f"{_part(metrics, scored)}{photos_in_words(scored, 'unseen photo')} at {_sizes(metrics)}"
+    return f"{_part(metrics, scored)}{photos_in_words(scored, 'test photo')} at {_sizes(metrics)}"
 
 
 def _part(metrics: dict[str, Any], photos: int) -> str:

@@ -18,9 +18,7 @@ def chosen_backend(device: str, progress: Progress | None = None) -> BackendName
     """ "warp" if its kernels run on ``device`` ("cpu" or "cuda"), else "torch"; then the reason is said."""
     why = why_not_warp(device)
     if why and progress:
-        progress.note(
-            "hardware.torch-alone", f"the hash-grid field is computed by torch alone, several times slower: {why}"
-        )
+        progress.note("hardware.torch-alone", f"the hash-grid field runs on torch alone, several times slower: {why}")
     return "torch" if why else "warp"
 
 
@@ -32,7 +30,7 @@ def backend_of_field(trained_with: BackendName, device: str, progress: Progress 
     if progress:
         progress.note(
             "hardware.trained-without-warp",
-            "the hash-grid field is computed by torch alone, as it was trained: several times slower than by Warp",
+            "the hash-grid field runs on torch alone, as it was trained, several times slower than on Warp",
         )
     return "torch"
 
@@ -80,13 +78,13 @@ def why_not_warp(device: str) -> str | None:
     except (ImportError, OSError) as error:
         if isinstance(error, OSError) and error.filename is not None:  # a library that does not load names none
             return _not_kept(error)
-        return f"warp-lang does not load here: {error}"
+        return f"warp-lang cannot be loaded: {error}"
     return kernels.unavailable_reason(device)
 
 
 def _not_kept(error: OSError) -> str:
     """Without a home that can be written to, compiled kernels have no place."""
-    return f"compiled kernels cannot be kept here ({error}); the variable WARP_CACHE_PATH can name another folder"
+    return f"the kernel cache cannot be written ({error}); set WARP_CACHE_PATH to another folder"
 
 
 @contextlib.contextmanager

@@ -49,7 +49,7 @@ def check_memory(needed: float, what: str, why: str, hint: str) -> None:
         raise StageError(
             "hardware.not-enough-memory",
             f"not enough memory for {what}",
-            f"{why} {bytes_in_words(needed)} and {bytes_in_words(free)} are free",
+            f"{why} {bytes_in_words(needed)}, and only {bytes_in_words(free)} are free",
             hint,
         )
 

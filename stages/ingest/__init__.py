@@ -18,7 +18,7 @@ from stages.io.files import write_json
 from stages.io.photos import write_photos
 
 INPUTS: tuple[str, ...] = ()
-VERSION = 16
+VERSION = 17
 EXIT_CODE = 10
 RESUMES = False
 NOTES = "notes.json"
@@ -36,12 +36,13 @@ class Config(StageConfig):
         description="A folder of photos, a video, a transforms.json, or a folder with transforms_train.json.",
     )
     cameras: OptionalSourcePath = Field(
-        default=None, description="Poses to import for a folder of photos: a transforms file or a COLMAP model."
+        default=None,
+        description="Poses to import for a folder of photos: a transforms file, a COLMAP model or a poses_bounds.npy.",
     )
     frames: int = Field(
         default=300,
         ge=MIN_FRAMES,
-        description=("Maximum number of frames taken from a video; they are further apart where the camera moves far."),
+        description="Maximum number of frames taken from a video; a camera that moves far gets them further apart.",
     )
 
 

@@ -297,7 +297,7 @@ def _checked(
         raise messages.all_plain([(photo.name, photo.one_colour) for photo in taken if photo.one_colour])
     if source.kind != "photos":
         return {}
-    progress.update("looking for photos that are nearly the same")
+    progress.update("looking for near-duplicates")
     return _near_duplicates(taken, progress)
 
 

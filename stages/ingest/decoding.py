@@ -91,14 +91,14 @@ def decode(path: Path) -> Decoded:
 def _open(path: Path) -> Image.Image:
     """The image with its header read, of a size we accept."""
     if path.suffix.lower() in RAW_EXTENSIONS:
-        raise DecodeError("camera raw files are not read; export JPEG, PNG or TIFF")
+        raise DecodeError("camera raw files are not supported; export JPEG, PNG or TIFF")
     library = pillow()
     try:
         image = library.open(path, formats=_FORMATS)
     except library.UnidentifiedImageError as error:
         raise DecodeError(_unrecognised(path)) from error
     except FileNotFoundError as error:
-        gone = "a link to a file that is not there" if path.is_symlink() else "there is no such file"
+        gone = "a broken link" if path.is_symlink() else "there is no such file"
         raise DecodeError(gone) from error
     except Exception as error:  # on damaged files Pillow's parsers raise whatever they run into
         if isinstance(error, OSError) and error.errno is not None:  # not Pillow's but the system's
@@ -109,7 +109,7 @@ def _open(path: Path) -> Image.Image:
         megapixels = width * height / 1e6
         raise DecodeError(f"{width}×{height} is {megapixels:.0f} megapixels; the limit is {MAX_PIXELS / 1e6:.0f}")
     if min(width, height) < MIN_SIDE_PX:
-        raise DecodeError(f"{width}×{height} is too small; at least {MIN_SIDE_PX} pixels a side")
+        raise DecodeError(f"{width}×{height} is too small; each side needs at least {MIN_SIDE_PX} pixels")
     return image
 
 
@@ -226,7 +226,7 @@ def _what_is_missing(image: Any, error: OSError) -> str:
     except OSError:  # the decoder refused before there were any pixels
         return f"{word}: {error}"
     missing = 1 - (np.flatnonzero(rows)[-1] + 1) / image.height if rows.any() else 1.0
-    return f"{word}: {100 * missing:.0f} % of the picture is missing" if missing >= 0.005 else f"{word}: {error}"
+    return f"{word}: {100 * missing:.0f} % of the image is missing" if missing >= 0.005 else f"{word}: {error}"
 
 
 def _to_eight_bit(image: Image.Image) -> Image.Image:
@@ -240,17 +240,17 @@ def _to_eight_bit(image: Image.Image) -> Image.Image:
     try:
         return image.convert("L" if image.mode == "1" else "RGB")
     except ValueError as error:
-        raise DecodeError(f"its pixel format {image.mode} is not read; export JPEG, PNG or TIFF") from error
+        raise DecodeError(f"its pixel format {image.mode} is not supported; export JPEG, PNG or TIFF") from error
 
 
 def _quantised(image: Image.Image) -> Image.Image:
     """Grey of 16 bits, or of floats in [0, 1], as 8 bits."""
     values = np.asarray(image)
     if wrong := int(values.size - np.isfinite(values).sum()):
-        raise DecodeError(f"{wrong:,} of its {values.size:,} pixels are no numbers (NaN or infinite)")
+        raise DecodeError(f"{wrong:,} of its {values.size:,} pixels are NaN or infinite")
     limit = 1.0 if image.mode == "F" else 65535.0
     if not (values.min() >= 0 and values.max() <= limit):
-        raise DecodeError(f"pixel values from {values.min()} to {values.max()}; export it with 8 or 16 bits")
+        raise DecodeError(f"its pixel values run from {values.min()} to {values.max()}; export it with 8 or 16 bits")
     return pillow().fromarray(np.rint(values * (255 / limit)).astype(np.uint8))
 
 
@@ -268,7 +268,7 @@ def _to_srgb(image: Image.Image, profile: bytes | None, notes: list[str]) -> tup
             return source, True
         converted = ImageCms.applyTransform(source, transform) or source  # None only for in-place work
     except (ImageCms.PyCMSError, OSError, ValueError) as error:
-        notes.append(f"colour profile ignored ({error})")
+        notes.append(f"its colour profile is ignored ({error})")
         return image.convert(mode), False
     return converted, False
 

@@ -122,12 +122,12 @@ class FrameFiles:
             is_link = self.follows_links and file.is_symlink() and file.parent.resolve().is_relative_to(root.resolve())
             if inside or is_link:
                 return file
-        of_photos = "Give the folder of the photos apart: pipeline run PHOTOS --cameras FILE"
+        of_photos = "Give the photos and the file separately: pipeline run PHOTOS --cameras FILE"
         raise StageError("ingest.outside-folder", 
             f"rejected the {what} {file_path[:MAX_LETTERS]!r}",
             "its path is absolute" if absolute else f"it leads out of the folder {folder}",
             of_photos if what == "photo" and not self.follows_links else
-            f"A transforms file may name {what}s inside {root} only, and not in linked folders there.",
+            f"A transforms file may only name {what}s inside {root}, and none in linked folders there.",
         )  # fmt: skip
 
     def _alike(self, folder: Path, name: str) -> str | None:
@@ -158,8 +158,8 @@ def _ambiguous(name: str, what: str, root: Path, found: Sequence[Path]) -> Stage
     return StageError(
         "ingest.ambiguous-path",
         f"cannot tell which {what} {name[:MAX_LETTERS]!r} is",
-        f"it is no path in {root}, and the ends of {len(names)} files there fit it alike: {listed(names, MAX_NAMES)}",
-        f"Write the paths in the transforms file as they are in {root}, for example {names[0]}",
+        f"{root} has no such path, and {len(names)} files there end like it: {listed(names, MAX_NAMES)}",
+        f"Write the paths in the transforms file relative to {root}, for example {names[0]}",
     )
 
 

@@ -29,7 +29,7 @@ RAW_EXTENSIONS = (
 MASKS = "masks"  # the folder of masks, whatever its letters' case
 MAX_OTHER_FILES = 2  # files beside a video, too few to be a set of photos
 FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
-_LINKS_HINT = "Fetch them (git annex get, dvc pull), or connect the drive that they lie on."
+_LINKS_HINT = "Fetch them (git annex get, dvc pull), or connect the drive that holds them."
 
 
 def list_photos(root: Path) -> tuple[Path, ...]:
@@ -42,7 +42,7 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     """
     found = files_below(root, _is_photo_folder)
     if not found:
-        raise StageError("ingest.empty-folder", f"{root} is empty", "there is no file in it", FOLDER_HINT)
+        raise StageError("ingest.empty-folder", f"{root} is empty", "it holds no file", FOLDER_HINT)
     photos, videos = [file for file in found if _may_be_photo(file)], _videos(found)
     unknown = not any(file.suffix.lower() in IMAGES + RAW_EXTENSIONS for file in photos)
     if len(videos) == 1 and unknown and len(photos) <= MAX_OTHER_FILES:
@@ -121,5 +121,8 @@ def _no_photos(root: Path, found: list[Path], videos: list[Path]) -> StageError:
         )  # fmt: skip
     suffixes = ", ".join(sorted({file.suffix.lower() or file.name for file in found})[:5])
     return StageError(
-        "ingest.no-photos", f"no photos in {root}", f"its {len(found)} files are no images ({suffixes})", FOLDER_HINT
+        "ingest.no-photos",
+        f"no photos in {root}",
+        f"none of its {len(found)} files is an image ({suffixes})",
+        FOLDER_HINT,
     )

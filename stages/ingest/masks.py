@@ -18,8 +18,8 @@ USE_FROM = 128  # of 255: from here on a pixel counts as used
 NEARLY_BLACK, NEARLY_WHITE = 16, 239  # of 255: what compression leaves of black and white
 MIN_GREY, MAX_LABELS = 0.25, 32  # of a picture's pixels; values
 STILL_BACKGROUND_HINT = (
-    "If it was the thing that turned, before a still background, mask the background (masks/NAME.png, black is "
-    "ignored) or use a plain backdrop."
+    "If the object turned in front of a still background, mask the background (masks/NAME.png, black is ignored) "
+    "or use a plain backdrop."
 )
 
 
@@ -72,7 +72,7 @@ def read_mask(file: Path, width: int, height: int, orientation: int, stored: boo
     size, found = (width, height), (pixels.shape[1], pixels.shape[0])
     fits, fits_stored = _same_shape(found, size), _same_shape(found, _stored(size, orientation))
     if not (fits or fits_stored):
-        shapes = f"{found[0]}×{found[1]} and the photo {width}×{height}"
+        shapes = f"{found[0]}×{found[1]} and the photo is {width}×{height}"
         raise DecodeError(f"its mask {file.name} does not fit: it is {shapes}")
     ambiguous = fits and fits_stored and orientation != 1 and decoded.camera_key.orientation == 1
     turned = stored if ambiguous else not fits
@@ -84,7 +84,7 @@ def read_mask(file: Path, width: int, height: int, orientation: int, stored: boo
     if not pixels.any():
         alpha = ", where it is not transparent" if decoded.pixels.shape[2] == 4 else ""
         raise DecodeError(
-            f"its mask {file.name} ignores all of it (its brightest value is {light.max()} of 255{alpha})"
+            f"its mask {file.name} ignores the whole photo (its brightest value is {light.max()} of 255{alpha})"
         )
     return Mask(pixels, turned, resized, ambiguous, grey)
 

@@ -57,22 +57,23 @@ def note_unused(source: Source, photos: Path, progress: Progress) -> None:
     """Note what lies beside the photos, which were found in ``photos``, and could be used, and how."""
     if beside := photos_beside(source, photos):
         folder = shown(str(photos))
-        lie, them = ("1 photo lies", "is") if beside == 1 else (f"{beside} photos lie", "are")
+        lie, them = ("1 photo", "is") if beside == 1 else (f"{beside} photos", "are")
         how = f"to use all, move them into images/; to use only them, move images/ out of {folder}"
-        progress.note("ingest.photos-beside-images", f"{lie} in {folder} beside images/ and {them} not used: {how}")
+        progress.note("ingest.photos-beside-images", f"{lie} in {folder} beside images/ {them} not used: {how}")
     if others := source.other_endings:
         which = listed([f"{shown(photo)} ({shown(path)})" for path, photo in others.items()], 3)
-        words = f"{len(others)} frames name files of another ending than the photos that are taken for them: {which}"
+        words = f"{len(others)} frames use photos of the same name with another file ending: {which}"
         progress.note("ingest.other-endings", words)
     if (cameras := unused_cameras(source)) is not None:
         place, option = shown(str(cameras)), shown(f"--cameras {shlex.quote(str(cameras))}")
-        progress.note("ingest.unused-cameras", f"cameras lie in {place} and are not used: {option} would use them")
+        progress.note("ingest.unused-cameras", f"the cameras in {place} are not used; to use them: {option}")
     if (mask := mask_beside(source, photos)) is not None:
         progress.note(*_one_mask(str(mask)))
     if (masks := unused_masks(source)) is not None:
         lie, wanted = shown(str(masks)), shown(str(source.root / "masks"))
         progress.note(
-            "ingest.unused-masks", f"masks lie in {lie} and are not used: in {wanted} they would be (black is ignored)"
+            "ingest.unused-masks",
+            f"the masks in {lie} are not used; to use them, move them to {wanted} (black is ignored)",
         )
 
 
@@ -81,14 +82,14 @@ def excluded(files: Mapping[str, str]) -> list[Note]:
     used = instant_ngp_masks(files).values()
     notes = list[Note]()
     if used:
-        words = f"{len(used)} masks of instant-ngp's ({shown(min(used))}, …) are used: white is ignored"
+        words = f"{len(used)} instant-ngp masks ({shown(min(used))}, …) are used: white is ignored"
         notes.append(Note("ingest.instant-ngp-masks", words))
     files = {name: photo for name, photo in files.items() if name not in used}
     if not files:
         return notes
     named = [f"{shown(name)} (of {shown(photo)})" for name, photo in sorted(files.items())]
     count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
-    words = f"{count} excluded, named as a mask, depth map or other copy of a photo: {listed(named, 3)}"
+    words = f"{count} excluded, with the name of a mask, depth map or other copy of a photo: {listed(named, 3)}"
     notes.append(Note("ingest.excluded", words))
     if mask := next((name for name, photo in sorted(files.items()) if photo == ALL_PHOTOS), None):
         notes.append(_one_mask(mask))
@@ -97,14 +98,14 @@ def excluded(files: Mapping[str, str]) -> list[Note]:
         notes.append(
             Note(
                 "ingest.mask-elsewhere",
-                f"to be used as a mask, whose black is ignored, {shown(mask)} would have to be {shown(place)}",
+                f"to use {shown(mask)} as a mask, whose black is ignored, rename it {shown(place)}",
             )
         )
     return notes
 
 
 def _one_mask(name: str) -> Note:
-    words = f"{shown(name)} is not used: as a mask of all photos it would have to be copied to masks/NAME.png for each"
+    words = f"{shown(name)} is not used; to use it as the mask of all photos, copy it to masks/NAME.png for each"
     return Note("ingest.one-mask", words)
 
 
@@ -114,7 +115,7 @@ def excluded_by_values(files: Sequence[str]) -> list[Note]:
         return []
     count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
     named = listed([shown(name) for name in files], 3)
-    words = f"{count} excluded as depth maps, being grey of 16 bits or of floats among photos in colour: {named}"
+    words = f"{count} excluded as depth maps, with grey values of 16 bits or floats among colour photos: {named}"
     return [Note("ingest.depth-maps", words)]
 
 
@@ -123,8 +124,8 @@ def bracketed(brackets: Brackets) -> str:
     last = brackets.exposures - 1
     names = {0: "darkest", last: "brightest", last / 2: "middle one"}
     which = names.get(brackets.position, f"number {brackets.position + 1} from the darkest")
-    each = f"{brackets.places} places were photographed with {brackets.exposures} exposures each"
-    return f"{each}: the {which} of each is kept, where least is clipped or too dark"
+    each = f"exposure brackets: {brackets.places} poses have {brackets.exposures} exposures each"
+    return f"{each}; the {which} of each is kept, which is clipped or too dark in the fewest pixels"
 
 
 def nearly_black(brightest: Sequence[int]) -> list[Note]:
@@ -132,8 +133,8 @@ def nearly_black(brightest: Sequence[int]) -> list[Note]:
     ``brightest`` has the largest of each photo, of 255."""
     if (most := max(brightest, default=255)) > NEARLY_BLACK:
         return []
-    how = "if their values are of 10 or 12 bits in files of 16, scale them up first, those of 12 by 16"
-    return [Note("ingest.nearly-black", f"all photos are nearly black, at most {most} of 255: {how}")]
+    how = "if these are 16-bit files with 12-bit values, multiply the values by 16 (10-bit values by 64)"
+    return [Note("ingest.nearly-black", f"all photos are nearly black (at most {most} of 255): {how}")]
 
 
 def note_findings(photos: Sequence[Photo], progress: Progress) -> None:
@@ -141,9 +142,7 @@ def note_findings(photos: Sequence[Photo], progress: Progress) -> None:
     same = [f"{shown(p.name)} (as {shown(p.near_duplicate_of)})" for p in photos if p.near_duplicate_of]
     if same:
         are = _photos_are(len(same))
-        progress.note(
-            "ingest.near-duplicates", f"{are} nearly the same picture as another and left out of matching: {_few(same)}"
-        )
+        progress.note("ingest.near-duplicates", f"{are} left out of matching as near-duplicates: {_few(same)}")
     blurred = [
         f"{shown(p.name)} ({p.relative_sharpness:.2f} ×)"
         for p in photos
@@ -151,20 +150,20 @@ def note_findings(photos: Sequence[Photo], progress: Progress) -> None:
     ]
     if blurred:
         are = _photos_are(len(blurred))
-        progress.note("ingest.blurred", f"{are} far less sharp than those before and after, and kept: {_few(blurred)}")
+        progress.note("ingest.blurred", f"{are} far less sharp than the neighbouring photos, but kept: {_few(blurred)}")
 
 
 def note_masks(ignored: Sequence[float], turned: int, resized: int, photos: int, progress: Progress) -> None:
     """How many of the photos have masks, how much these ignore, and how many were made to fit."""
     if not ignored:
         return
-    turned_words = f", {turned} turned upright like the photo" if turned else ""
-    resized_words = f", {resized} made as large as the photo" if resized else ""
+    turned_words = f", {turned} are turned upright like their photos" if turned else ""
+    resized_words = f", {resized} are resized to their photos" if resized else ""
     share = sum(ignored) / len(ignored)
-    polarity = "; black is ignored: invert masks that mark with white what to ignore" if share > MANY_IGNORED else ""
+    polarity = "; black is ignored: invert your masks if white marks what to ignore" if share > MANY_IGNORED else ""
     progress.note(
         "ingest.masks",
-        f"masks of {len(ignored)} of {photos} photos ignore {share:.0%} of them{turned_words}{resized_words}{polarity}",
+        f"masks ignore {share:.0%} of {len(ignored)} of {photos} photos{turned_words}{resized_words}{polarity}",
     )
 
 
@@ -174,7 +173,7 @@ def stray_masks(files: Sequence[str]) -> list[Note]:
         return []
     named = listed([shown(name) for name in files], 3)
     are = "is" if len(files) == 1 else "are"
-    words = f"{named} {are} no photo's mask: masks are called after their photos, masks/NAME.png"
+    words = f"{named} {are} not the mask of any photo: a mask has the name of its photo, masks/NAME.png"
     return [Note("ingest.stray-masks", words)]
 
 
@@ -182,8 +181,8 @@ def grey_masks(names: Sequence[str]) -> list[Note]:
     """A note on photos whose masks are in shades of grey."""
     if not names:
         return []
-    words = f"masks of {len(names)} photos are neither black nor white for the most part, as photos are"
-    words = f"{words}: what is brighter than half is used. Look at masks/ of {listed([shown(n) for n in names], 3)}"
+    words = f"masks of {len(names)} photos are mostly grey"
+    words = f"{words}: pixels brighter than half are used. Check the masks of {listed([shown(n) for n in names], 3)}"
     return [Note("ingest.grey-masks", words)]
 
 
@@ -191,8 +190,8 @@ def taken_as_upright(names: Sequence[str]) -> list[Note]:
     """A note on photos that EXIF turned and whose masks fit them turned or not."""
     if not names:
         return []
-    which = f"masks of {len(names)} photos fit upright and as stored alike (EXIF orientation)"
-    words = f"{which}, and are taken as upright: look at masks/ of {_few([shown(name) for name in names])}"
+    which = f"masks of {len(names)} photos fit both with and without the EXIF orientation"
+    words = f"{which} and are used as upright ones. Check the masks of {_few([shown(name) for name in names])}"
     return [Note("ingest.ambiguous-masks", words)]
 
 
@@ -213,9 +212,7 @@ def too_few(source: Source, names: Sequence[str], rejected: Sequence[Rejection])
             "ingest.no-usable-photo",
             f"none of the {len(rejected)} files in {source.root} is a usable photo",
             first,
-            "Correct the masks (black is ignored, white is used), or move them away to go without."
-            if of_masks
-            else HINT,
+            "Correct the masks (black is ignored, white is used), or remove them." if of_masks else HINT,
         )
     only = shown(names[0])
     if rejected and all(rejection.reason.startswith("identical to ") for rejection in rejected):
@@ -228,11 +225,13 @@ def too_few(source: Source, names: Sequence[str], rejected: Sequence[Rejection])
     if rejected:
         return StageError(
             "ingest.one-usable-photo",
-            f"only one photo can be used, {only}",
+            f"{only} is the only usable photo",
             f"{len(rejected)} other files were rejected",
             HINT,
         )
-    return StageError("ingest.one-photo", "there is only one photo", f"{only}; a scene needs at least two", HINT)
+    return StageError(
+        "ingest.one-photo", "there is only one photo", f"a scene needs at least two, and there is only {only}", HINT
+    )
 
 
 def all_the_same(photos: int) -> StageError:
@@ -240,7 +239,7 @@ def all_the_same(photos: int) -> StageError:
     why = "the camera did not move between them, so they show no depth"
     return StageError(
         "ingest.same-picture",
-        f"all {photos} photos are nearly the same picture",
+        f"all {photos} photos are near-duplicates",
         why,
         f"{HINT} {STILL_BACKGROUND_HINT}",
     )
@@ -249,9 +248,9 @@ def all_the_same(photos: int) -> StageError:
 def all_plain(colours: Sequence[tuple[str, str]]) -> StageError:
     """The error for photos that show nothing: (name, the one colour of all its pixels)."""
     name, colour = colours[0]
-    why = f"{shown(name)} is {colour} everywhere, so there is nothing that could be found or learnt"
-    hint = "Look at the photos: a cap on the lens, a wrong exposure, or a failed export."
-    return StageError("ingest.plain-photos", f"all {len(colours)} photos show one single colour", why, hint)
+    why = f"{shown(name)} is {colour} everywhere"
+    hint = "Look at the photos: the lens cap was on, the exposure was wrong, or an export failed."
+    return StageError("ingest.plain-photos", f"each of the {len(colours)} photos has one single colour", why, hint)
 
 
 def summary(source: Source, photos: Sequence[Photo], rejected: Sequence[Rejection]) -> str:

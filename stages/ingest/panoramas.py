@@ -33,7 +33,7 @@ def is_panorama(pixels: np.ndarray, xmp: str | bytes | None = None) -> bool:
 def cutting_advice(source: str, view: str) -> str:
     """What to do about a panorama that ffmpeg reads from ``source``; it would write one view to ``view``."""
     ffmpeg = f"ffmpeg -i {source} -vf v360=e:flat:h_fov=90:v_fov=90:w=1500:h=1500:yaw=0 {view}"
-    return f"cut it into perspective views, for example with {ffmpeg}, and so for yaw 60, 120, 180, -60 and -120"
+    return f"cut it into perspective views, for example with {ffmpeg}, and the same for yaw 60, 120, 180, -60 and -120"
 
 
 def _goes_round(pixels: np.ndarray) -> bool:

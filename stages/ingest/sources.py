@@ -39,8 +39,8 @@ OTHER_CAMERAS = {
     ".csv": ("a table, as RealityScan writes it", _CONVERTER.format("realitycapture")),
     ".xmp": ("one photo's XMP file, as RealityScan writes it", _CONVERTER.format("realitycapture")),
     ".db": (
-        "COLMAP's database, which holds features and matches, and no poses",
-        "Give the folder of the model that was made of it (sparse/0), or leave --cameras out.",
+        "COLMAP's database, which holds features and matches but no poses",
+        "Give the folder of its model (sparse/0), or leave out --cameras.",
     ),
     ".out": ("a Bundler file", ""),
     ".nvm": ("a VisualSFM file", ""),
@@ -102,7 +102,7 @@ def find_source(photos: Path, cameras: Path | None = None) -> Source:
 
 def cannot_read(path: Path | str, error: OSError) -> StageError:
     """The error for a file or folder of the user's that cannot be read, or has gone since it was listed."""
-    hint = "Check that it is still there and may be read (chmod -R u+rX), then run again."
+    hint = "Check that it exists and is readable (chmod -R u+rX), then run again."
     return StageError("ingest.cannot-read", f"cannot read {path}", (error.strerror or str(error)).lower(), hint)
 
 
@@ -239,7 +239,7 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
                 "ingest.workspace-given",
                 f"{photos} is a workspace",
                 "it holds results, not photos",
-                f"Go on with it: pipeline resume {photos}",
+                f"Continue it: pipeline resume {photos}",
             )
     elif (suffix := photos.suffix.lower()) in IMAGES:
         raise StageError(
@@ -252,7 +252,7 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
         raise StageError(
             "ingest.unknown-input",
             f"cannot use {photos.name}",
-            "it is no folder of photos, video or transforms.json",
+            "it is not a folder of photos, a video or a transforms.json",
             FOLDER_HINT,
         )
     elif cameras is not None and suffix == ".json":
@@ -268,14 +268,14 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
 
 def _unknown_cameras(cameras: Path) -> StageError:
     suffix = cameras.suffix.lower()
-    what, hint = OTHER_CAMERAS.get(suffix, ("of another kind", ""))
+    what, hint = OTHER_CAMERAS.get(suffix, ("of an unknown kind", ""))
     if suffix in (".bin", ".txt"):
         what, hint = "one file of a COLMAP model", f"Give its folder: --cameras {cameras.parent}"
     return StageError(
         "ingest.unknown-cameras",
         f"cannot use the cameras {cameras.name}",
-        f"it is {what}; a transforms file (.json), the folder of a COLMAP model and poses_bounds.npy are read",
-        hint or "Export one of these, or leave --cameras out, and the cameras are found from the photos.",
+        f"it is {what}; supported are transforms files (.json), folders of COLMAP models and poses_bounds.npy",
+        hint or "Export one of these, or leave out --cameras to find the cameras from the photos.",
     )
 
 
@@ -312,7 +312,7 @@ def _none_of_its_photos(cameras: Path, root: Path, names: list[str]) -> StageErr
     there = f"{root} has {listed(here, FEW_NAMES)}" if here else f"there are no photos in {root}"
     return StageError(
         "ingest.cameras-of-other-photos",
-        f"none of the {len(names)} photos of {cameras.name} is there",
+        f"none of the {len(names)} photos in {cameras.name} exists",
         f"it names {listed(names, FEW_NAMES)}, and {there}",
         f"Give the folder with its photos: pipeline run PHOTOS --cameras {cameras}",
     )
@@ -339,8 +339,8 @@ def _sorted_inside(root: Path, files: set[Path]) -> tuple[Path, ...]:
     if outside:
         raise StageError(
             "ingest.photo-outside",
-            f"{min(outside)} is not among the photos",
-            f"the transforms file names it, but it lies outside {root}",
+            f"{min(outside)} is outside the photo folder",
+            f"the transforms file names it, and photos must lie in {root}",
             "Give the folder that holds all photos of the transforms file.",
         )
     return tuple(sorted(files, key=lambda file: file.relative_to(root).as_posix()))
@@ -391,18 +391,18 @@ def _colmap_model(folder: Path, photos: Sequence[str]) -> Path:
             "ingest.no-colmap-model",
             f"no COLMAP model in {folder}",
             _what_is_missing(folder),
-            "Give the folder of a COLMAP model (sparse/0), a transforms.json or a poses_bounds.npy; or leave --cameras "
-            "out, and the cameras are found from the photos.",
+            "Give the folder of a COLMAP model (sparse/0), a transforms.json or a poses_bounds.npy; or leave out "
+            "--cameras to find the cameras from the photos.",
         )
     if len(models) > 1:
         counts = {model: _cameras_of(model, photos) for model in models}
-        each = ", ".join(f"{model.relative_to(folder)} with {counts[model]}" for model in models)
+        each = ", ".join(f"{counts[model]} ({model.relative_to(folder)})" for model in models)
         best = max(models, key=lambda model: counts[model])
         raise StageError(
             "ingest.several-colmap-models",
             f"{len(models)} COLMAP models in {folder}",
-            f"cameras of the {len(photos)} photos are in {each}: it is not clear which one to use",
-            f"Give the one with most: --cameras {best}",
+            f"of the {len(photos)} photos they have cameras for: {each}",
+            f"Choose one, for example the one with most photos: --cameras {best}",
         )
     return models[0]
 
@@ -413,11 +413,11 @@ def _what_is_missing(folder: Path) -> str:
     parts = [path.relative_to(folder).as_posix() for path in paths if path.is_file()]
     here = [path for path in folder.iterdir() if path.is_file()] if folder.is_dir() else []
     if parts:
-        return f"it needs cameras and images, both in .bin or in .txt, and there is only {listed(parts, FEW_NAMES)}"
+        return f"a model needs cameras and images, both .bin or both .txt, and there is only {listed(parts, FEW_NAMES)}"
     if database := next((path.name for path in here if path.suffix.lower() == ".db"), None):
-        return f"{database} holds COLMAP's features and matches, and no poses"
-    there = f"; there is {listed(sorted(path.name for path in here), FEW_NAMES)}" if here else ""
-    return f"there is no cameras and images with .bin or .txt, nor a transforms.json{there}"
+        return f"{database} is COLMAP's database: it holds features and matches but no poses"
+    there = f"; it holds {listed(sorted(path.name for path in here), FEW_NAMES)}" if here else ""
+    return f"it has no cameras and images files (.bin or .txt) and no transforms.json{there}"
 
 
 def _cameras_of(model: Path, photos: Sequence[str]) -> int:
@@ -440,6 +440,6 @@ def _cameras_of_video(video: Path) -> StageError:
     return StageError(
         "ingest.cameras-of-video",
         f"cannot use --cameras with {video.name}",
-        "it is a video, and which of its frames become photos is decided by ingest: no poses can be imported for them",
-        "Leave --cameras out, or give the folder of the photos that the cameras belong to.",
+        "stage ingest chooses the frames of a video, so no poses can be imported for them",
+        "Leave out --cameras, or give the folder of the photos that the cameras belong to.",
     )

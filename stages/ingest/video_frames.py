@@ -49,6 +49,8 @@ PIXEL_ASPECTS = (0.25, 4.0)
 # Diffuse white is at 203 cd/m² (ITU-R BT.2408): that becomes about the white of sRGB. What is lighter, up to MAX_NITS,
 # is pressed into the lightest fifth.
 HDR_TRANSFERS = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
+# Of other video, by ffmpeg's name of its primaries.
+WIDE_PRIMARIES = {"bt2020": "BT.2020", "smpte432": "Display P3", "smpte431": "DCI P3"}
 WHITE_NITS, MAX_NITS, LINEAR_UP_TO = 203, 1000, 0.8
 JPEG_QUALITY = 95  # far closer to the frame than the video is to what the camera saw
 
@@ -80,7 +82,7 @@ def take_frames(video: Path, most: int, folder: Path, progress: Progress) -> lis
     The frames stand upright and their pixels are square: what the video says of its rotation and of the shape of its
     pixels is undone.
     """
-    transfer = _usable_transfer(video, progress)
+    filters = _to_srgb(video, progress)
     frames = _measure(video, progress)
     chosen = choose_frames(frames, most)
     if len(chosen) < MIN_FRAMES:
@@ -88,10 +90,10 @@ def take_frames(video: Path, most: int, folder: Path, progress: Progress) -> lis
     way = frames[-1].path
     progress.note(
         "ingest.frames-taken",
-        f"{len(chosen)} of {len(frames)} frames taken: the sharpest of each step of about "
-        f"{way / (len(chosen) - 1):.0%} of the picture's width, {way:.1f} widths in all",
+        f"took {len(chosen)} of {len(frames)} frames: the sharpest of each time the image moves by about "
+        f"{way / (len(chosen) - 1):.0%} of its width; it moves by {way:.1f} widths in all",
     )
-    return list(_write(video, frames, chosen, transfer, folder, progress))
+    return list(_write(video, frames, chosen, filters, folder, progress))
 
 
 def choose_frames(frames: Sequence[Frame], most: int) -> list[int]:
@@ -147,13 +149,13 @@ def _measure(video: Path, progress: Progress) -> list[Frame]:
             frames.append(Frame(time_s, motion.path_to(at_most(grey, FLOW_WIDTH)), sharpness(grey)))
             if len(frames) % 10 == 0:
                 share = len(frames) / announced / 2 if announced >= len(frames) else None
-                progress.update(f"looked at {len(frames)} frames of {video.name}", share)
+                progress.update(f"examined {len(frames)} frames of {video.name}", share)
     if not frames:
-        raise _undecodable("ingest.no-frame-decodes", video, "not one frame of it can be decoded")
+        raise _undecodable("ingest.no-frame-decodes", video, "none of its frames can be decoded")
     if lacks_frames(len(frames), announced):
         progress.note(
             "ingest.frames-missing",
-            f"only {len(frames)} of {announced} frames of {video.name} can be decoded: is the file whole?",
+            f"only {len(frames)} of {announced} frames of {video.name} can be decoded: is the file complete?",
         )
     return frames
 
@@ -194,18 +196,18 @@ class _Motion:
 
 
 def _write(
-    video: Path, frames: Sequence[Frame], chosen: Sequence[int], transfer: str | None, folder: Path, progress: Progress
+    video: Path, frames: Sequence[Frame], chosen: Sequence[int], filters: str | None, folder: Path, progress: Progress
 ) -> Iterator[TakenFrame]:
     with _opened(video) as capture:
         stretch = _stretch(capture)
-        pictures = _as_stored(video, capture, chosen) if transfer is None else _tone_mapped(video, chosen, transfer)
+        pictures = _as_stored(video, capture, chosen) if filters is None else _filtered(video, chosen, filters)
         for number, stored in zip(chosen, pictures, strict=True):
             picture, file = _with_square_pixels(stored, stretch), folder / f"{number:06d}"
             write_jpeg(file, picture, JPEG_QUALITY)
             height, width = picture.shape[:2]
             time_s = round(frames[number].time_s - frames[0].time_s, 4)
             yield TakenFrame(number, time_s, frames[number].sharpness, file, width, height)
-            progress.update(f"writing the {len(chosen)} frames taken", 0.5 + number / max(chosen) / 2)
+            progress.update(f"writing {len(chosen)} frames", 0.5 + number / max(chosen) / 2)
 
 
 def _as_stored(video: Path, capture: cv2.VideoCapture, chosen: Sequence[int]) -> Iterator[np.ndarray]:
@@ -218,11 +220,11 @@ def _as_stored(video: Path, capture: cv2.VideoCapture, chosen: Sequence[int]) ->
             yield cv2.cvtColor(capture.retrieve()[1], cv2.COLOR_BGR2RGB)
 
 
-def _tone_mapped(video: Path, chosen: Sequence[int], transfer: str) -> Iterator[np.ndarray]:
-    """Frames of HDR video by their numbers, which rise, upright, as (h, w, 3) uint8 sRGB."""
+def _filtered(video: Path, chosen: Sequence[int], filters: str) -> Iterator[np.ndarray]:
+    """Frames by their numbers, which rise, after ffmpeg's ``filters``, upright, as (h, w, 3) uint8."""
     select = "+".join(f"eq(n,{number})" for number in chosen)
     words = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "error", "-i", f"file:{video.resolve()}"]
-    words += ["-vf", f"select='{select}',{tone_mapping(transfer)}", "-fps_mode", "passthrough"]
+    words += ["-vf", f"select='{select}',{filters},format=rgb24", "-fps_mode", "passthrough"]
     with subprocess.Popen(
         [*words, "-c:v", "ppm", "-f", "image2pipe", "-"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     ) as ffmpeg:
@@ -245,34 +247,51 @@ def tone_mapping(transfer: str) -> str:
     return (
         f"zscale=tin={transfer}:pin=bt2020:min=2020_ncl:t=linear:npl={WHITE_NITS}:agamma=false,format=gbrpf32le,"
         f"zscale=p=bt709,tonemap=mobius:param={LINEAR_UP_TO}:peak={MAX_NITS / WHITE_NITS:.3f}:desat=0,"
-        "zscale=t=iec61966-2-1:r=pc,format=rgb24"
+        "zscale=t=iec61966-2-1:r=pc,format=gbrp"
     )
 
 
-def _usable_transfer(video: Path, progress: Progress) -> str | None:
-    """The transfer characteristic of HDR video where it can be undone; None of other video. Says what is done."""
-    transfer = hdr_transfer(video)
-    if transfer is None:
+def gamut_mapping(primaries: str) -> str:
+    """The filters by which ffmpeg makes video of these primaries one of sRGB's. Its tones stay: video is shown by one
+    curve whatever its primaries."""
+    return (
+        f"zscale=pin={primaries}:tin=bt709:t=linear:m=gbr:r=pc,format=gbrpf32le,"
+        "zscale=p=bt709,zscale=t=bt709,format=gbrp"
+    )
+
+
+def _to_srgb(video: Path, progress: Progress) -> str | None:
+    """The filters by which ffmpeg makes sRGB of HDR and wide-gamut video; None of other video, and where this ffmpeg
+    lacks them. Says what is done."""
+    stream = _video_stream(video)
+    transfer = next((name for name in HDR_TRANSFERS if re.search(rf"[/ (]{name}\b", stream)), None)
+    wide = next((name for name in WIDE_PRIMARIES if re.search(rf"/{name}/|[ (]{name}[,)]", stream)), None)
+    if transfer:
+        code, what = "ingest.tone-mapped", f"{video.name} is HDR video ({HDR_TRANSFERS[transfer]})"
+        filters, done = tone_mapping(transfer), f"tone-mapped to sRGB, white at {WHITE_NITS} cd/m²"
+    elif wide:
+        code, what = "ingest.gamut-mapped", f"{video.name} has the wide gamut of {WIDE_PRIMARIES[wide]}"
+        filters, done = gamut_mapping(wide), "converted to sRGB"
+    else:
         return None
-    what = f"{video.name} is HDR video ({HDR_TRANSFERS[transfer]})"
     if can_tone_map():
-        progress.note("ingest.tone-mapped", f"{what}: its frames are tone-mapped to sRGB, white at {WHITE_NITS} cd/m²")
-        return transfer
-    source, filters = shell_quoted(video.name), f'-vf "{tone_mapping(transfer)},format=yuv420p"'
+        progress.note(code, f"{what}: its frames are {done}")
+        return filters
     progress.note(
         "ingest.no-tone-mapping",
-        f"{what}, and this ffmpeg has no filters zscale and tonemap: its frames look flat. Convert it first by one "
-        f"that has them: ffmpeg -i {source} {filters} -c:v libx264 -crf 12 sdr.mp4",
+        f"{what}, and its frames are not converted: this ffmpeg lacks the filters zscale and tonemap. Convert it with "
+        f"an ffmpeg that has them: ffmpeg -i {shell_quoted(video.name)} "
+        f'-vf "{filters},format=yuv420p" -c:v libx264 -crf 12 sdr.mp4',
     )
     return None
 
 
-def hdr_transfer(video: Path) -> str | None:
-    """The transfer characteristic of HDR video, by ffmpeg's name; None of other video, and where it cannot be read."""
+def _video_stream(video: Path) -> str:
+    """ffmpeg's line about the pixels of a video, empty where it cannot be read. Its colours stand in brackets: range,
+    then matrix/primaries/transfer, or one name where all three have the same."""
     words = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-i", f"file:{video.resolve()}"]
-    said = subprocess.run(words, capture_output=True).stderr.decode("utf-8", "replace")
-    stream = next((line for line in said.splitlines() if re.match(r" *Stream #.*: Video: ", line)), "")
-    return next((transfer for transfer in HDR_TRANSFERS if re.search(rf"[/ (]{transfer}\b", stream)), None)
+    told = subprocess.run(words, capture_output=True).stderr.decode("utf-8", "replace")
+    return next((line for line in told.splitlines() if re.match(r" *Stream #.*: Video: ", line)), "")
 
 
 @cache
@@ -292,7 +311,7 @@ def _opened(video: Path) -> Iterator[cv2.VideoCapture]:
     cv2.utils.logging.setLogLevel(before)
     try:
         if not capture.isOpened():
-            raise _undecodable("ingest.unknown-video", video, "it is damaged, or of a kind that is not known here")
+            raise _undecodable("ingest.unknown-video", video, "it is damaged or of an unknown format")
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         yield capture
     finally:
@@ -323,7 +342,7 @@ def _undecodable(code: str, video: Path, why: str) -> StageError:
 
 
 def _lost(video: Path, number: int) -> StageError:
-    return _undecodable("ingest.frame-lost", video, f"frame {number} could be decoded before and cannot now")
+    return _undecodable("ingest.frame-lost", video, f"frame {number} cannot be decoded a second time")
 
 
 def _panoramas(video: Path) -> StageError:
@@ -340,12 +359,12 @@ def _no_way(video: Path, frames: Sequence[Frame]) -> StageError:
             "ingest.short-video",
             what,
             f"it has only {count}",
-            "Film for ten seconds and more, walking around the scene.",
+            "Film for at least ten seconds while walking around the scene.",
         )
     way = frames[-1].path
     return StageError(
         "ingest.still-video",
         what,
-        f"the camera hardly moves: in {len(frames)} frames the picture shifts by {way:.1%} of its width",
+        f"the camera hardly moves: in {len(frames)} frames the image shifts by {way:.1%} of its width",
         "Walk around the scene while filming, slowly, so that every part of it is seen from several sides.",
     )

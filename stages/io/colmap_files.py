@@ -119,7 +119,7 @@ def _by_id(entries: Iterator[tuple[int, Entry]]) -> dict[int, Entry]:
     found: dict[int, Entry] = {}
     for number, entry in entries:
         if number in found:
-            raise ValueError(f"the id {number} is there twice")
+            raise ValueError(f"the id {number} appears twice")
         found[number] = entry
     return found
 
@@ -127,31 +127,31 @@ def _by_id(entries: Iterator[tuple[int, Entry]]) -> dict[int, Entry]:
 def _check(model: ModelFiles) -> None:
     for number, camera in model.cameras.items():
         if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
-            raise ValueError(f"camera {number} has {camera.width:.6g}×{camera.height:.6g} pixels")
+            raise ValueError(f"camera {number} has an impossible size of {camera.width:.6g}×{camera.height:.6g} pixels")
     ids = np.array(sorted(model.points), np.int64)
     for image in model.images.values():
         if image.camera not in model.cameras:
-            raise ValueError(f"image {image.name} is of camera {image.camera}, which is not there")
+            raise ValueError(f"image {image.name} names camera {image.camera}, which does not exist")
         if not (
             np.isfinite(image.pose).all() and image.pose[:4].any() and np.abs(image.pose[4:]).max() <= MAX_COORDINATE
         ):
             raise ValueError(f"image {image.name} has no pose: {', '.join(f'{v:.6g}' for v in image.pose)}")
         seen = image.points != NO_POINT
         if not (np.abs(image.xy[seen]) <= MAX_COORDINATE).all():
-            raise ValueError(f"image {image.name} has keypoints that are nowhere")
+            raise ValueError(f"image {image.name} has keypoints that are not finite or far outside")
         if (unknown := ~np.isin(image.points, ids) & seen).any():
-            raise ValueError(f"image {image.name} sees point {image.points[unknown][0]}, which is not there")
+            raise ValueError(f"image {image.name} names point {image.points[unknown][0]}, which does not exist")
     for number, point in model.points.items():
         if not (np.abs(point.xyz) <= MAX_COORDINATE).all():
-            raise ValueError(f"point {number} is nowhere: {', '.join(f'{v:.6g}' for v in point.xyz)}")
+            raise ValueError(f"point {number} has no usable position: {', '.join(f'{v:.6g}' for v in point.xyz)}")
 
 
 def _camera(name: str, width: int, height: int, params: tuple[float, ...]) -> Camera:
     name = name.upper()
     if name not in PARAMETERS:
-        raise ValueError(f"there is no camera model {name[:40]!r}")
+        raise ValueError(f"the camera model {name[:40]!r} does not exist")
     if len(params) != PARAMETERS[name]:
-        raise ValueError(f"a {name} camera has {PARAMETERS[name]} parameters, not {len(params)}")
+        raise ValueError(f"a {name} camera has {PARAMETERS[name]} parameters, but the file gives {len(params)}")
     return Camera(name, width, height, params)
 
 
@@ -174,7 +174,7 @@ class _Bytes:
         """The next ``count`` entries of ``size`` bytes."""
         end = self.place + count * size
         if end > len(self.data):
-            raise ValueError(f"it announces {count} entries after byte {self.place} and ends at {len(self.data)}")
+            raise ValueError(f"it promises {count} entries after byte {self.place} but ends at byte {len(self.data)}")
         part = memoryview(self.data)[self.place : end]
         self.place = end
         return part
@@ -192,7 +192,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
     for _ in range(*file.take("Q")):
         number, model, width, height = file.take("IiQQ")
         if model not in CAMERA_MODELS:
-            raise ValueError(f"there is no camera model {model}")
+            raise ValueError(f"the camera model {model} does not exist")
         name, count = CAMERA_MODELS[model]
         yield number, _camera(name, width, height, file.take(f"{count}d"))
 
@@ -228,7 +228,7 @@ class _Line(NamedTuple):
         """What stands in it, divided by spaces. Raises ValueError where ``what`` stands there is not whole."""
         fields = self.text.split()
         if len(fields) < least:
-            raise self.damaged(f"{what} has {len(fields)} fields where {least} belong")
+            raise self.damaged(f"{what} needs {least} fields and has {len(fields)}")
         return fields
 
     def damaged(self, why: str) -> ValueError:
@@ -252,7 +252,7 @@ def _numbers(line: _Line, fields: Sequence[str], kind: Callable[[str], Any]) -> 
         try:
             numbers.append(kind(field))
         except ValueError as error:
-            raise line.damaged(f"{field[:20]!r} is no {'whole ' * (kind is _whole)}number") from error
+            raise line.damaged(f"{field[:20]!r} is not a {'whole ' * (kind is _whole)}number") from error
     return numbers
 
 

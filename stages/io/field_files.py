@@ -98,7 +98,7 @@ def _untrained(
 def _trained_with(info: dict[str, Any]) -> BackendName:
     """Raises ValueError where that is not said, or no backend."""
     if "backend" not in info:
-        raise ValueError("an earlier version of this program wrote it, which did not say with which kernels it trained")
+        raise ValueError("an earlier version of this program wrote it and did not record the kernels that trained it")
     if info["backend"] not in get_args(BackendName):
         raise ValueError(f"kernels called {info['backend']!r} are unknown to this version")
     return info["backend"]
@@ -106,4 +106,4 @@ def _trained_with(info: dict[str, Any]) -> BackendName:
 
 def _check_size(numbers: int, stored: int) -> None:
     if 4 * numbers > stored:
-        raise ValueError(f"its settings ask for {4 * numbers} bytes of weights and more, and {stored} are there")
+        raise ValueError(f"its settings need at least {4 * numbers} bytes of weights, and it has {stored}")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -118,11 +119,28 @@ def read_tensors(path: Path) -> "dict[str, np.ndarray]":
 
 def write_png(path: Path, pixels: "np.ndarray") -> None:
     """Write (height, width, 3 or 4) or grey (height, width) uint8, folders included; packed fast, for pictures hardly
-    shrink any further."""
+    shrink any further. Raises StageError where :func:`check_png_encoder` does."""
     from PIL import Image
 
+    check_png_encoder()
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(path, format="PNG", compress_level=1)
+
+
+def check_png_encoder() -> None:
+    """Raise StageError where Pillow's PNG encoder would hang: on Linux, after pycolmap was loaded before Pillow, whose
+    wheel brings another zlib. Our own modules load Pillow first (``stages.sfm.colmap``); a caller's may not."""
+    loaded = list(sys.modules)
+    if sys.platform != "linux" or not {"pycolmap", "PIL._imaging"} <= sys.modules.keys():
+        return
+    if loaded.index("pycolmap") < loaded.index("PIL._imaging"):
+        raise StageError(
+            "io.pycolmap-before-pillow",
+            "No PNG file can be written in this process",
+            "pycolmap was imported before Pillow, and their wheels bring different versions of zlib: Pillow's PNG "
+            "encoder would hang",
+            "Put `import PIL.Image` before the first `import pycolmap` of the program",
+        )
 
 
 def write_jpeg(path: Path, pixels: "np.ndarray", quality: int) -> None:

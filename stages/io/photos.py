@@ -81,7 +81,7 @@ def read_photos(ingest_folder: Path) -> list[Photo]:
     photos = _read(ingest_folder).photos
     for file in (f for photo in photos for f in (photo.file, photo.mask, photo.opaque_mask) if f is not None):
         if not re.fullmatch(r"(images|masks|opaque)(/[\w-][\w.-]*)+", file, re.ASCII):
-            raise damaged("io.photo-outside", "photos.json", f"{file[:40]!r} is no file of this folder")
+            raise damaged("io.photo-outside", "photos.json", f"{file[:40]!r} is not a file in this folder")
     return photos
 
 

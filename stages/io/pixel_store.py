@@ -108,10 +108,10 @@ class PixelStore:
         free = available_bytes()
         fits = len(mapped) <= FITS * free
         if not fits:
-            sizes = f"{bytes_in_words(len(mapped))} at this size, {bytes_in_words(free)} of memory are free"
+            sizes = f"{bytes_in_words(len(mapped))} at this size, and only {bytes_in_words(free)} of memory are free"
             progress.note(
                 "io.photos-exceed-memory",
-                f"the photos take {sizes}: training waits for the disk; a larger --train.downscale will not",
+                f"the photos take {sizes}: the disk slows down training; a larger --train.downscale avoids that",
             )
         if hasattr(mapped, "madvise"):  # not on Windows
             mapped.madvise(mmap.MADV_WILLNEED if fits else mmap.MADV_RANDOM)
@@ -159,7 +159,7 @@ def _is_sound(store: PixelStore, progress: Progress) -> bool:
         return True
     progress.note(
         "io.pixels-changed",
-        f"the pixels of {damaged[0]} in {store.path.name} have changed on the disk: making it again",
+        f"rebuilding the pixel store {store.path.name}: the pixels of {damaged[0]} have changed on the disk",
     )
     store.path.unlink()
     return False
@@ -173,7 +173,7 @@ def _only_one(store: PixelStore, progress: Progress) -> Iterator[None]:
         try:
             lock.acquire(timeout=0.5)
         except Timeout:
-            progress.update("waiting for another program that reads the same photos")
+            progress.update("waiting for another process that reads the same photos")
     try:
         yield
     finally:
@@ -182,12 +182,12 @@ def _only_one(store: PixelStore, progress: Progress) -> Iterator[None]:
 
 def _write(store: PixelStore, load: Load, workers: int, progress: Progress) -> None:
     if store.path.exists():
-        found = f"{store.path.stat().st_size:,} bytes and not {store.size:,}"
-        progress.note("io.pixel-store-rebuilt", f"the pixel store {store.path.name} has {found}: making it again")
+        found = f"it has {store.path.stat().st_size:,} bytes instead of {store.size:,}"
+        progress.note("io.pixel-store-rebuilt", f"rebuilding the pixel store {store.path.name}: {found}")
     partial, photos, written = store.path.with_name(f"{store.path.name}.partial"), len(store.photos), 0
 
     def describe() -> tuple[str, float]:
-        waiting = f", the disk is taking {bytes_in_words(store.starts[-1])}" if written == photos else ""
+        waiting = f", writing {bytes_in_words(store.starts[-1])} to the disk" if written == photos else ""
         return f"read {written} of {photos} photos{waiting}", written / photos
 
     try:
@@ -209,7 +209,7 @@ def _write_photos(store: PixelStore, load: Load, workers: int, stream: BinaryIO)
     def write(index: int) -> None:
         pixels = load(index)
         if pixels.shape != store.shape(index):
-            raise ValueError(f"{store.photos[index].file} has shape {pixels.shape} and not {store.shape(index)}")
+            raise ValueError(f"{store.photos[index].file} has shape {pixels.shape} instead of {store.shape(index)}")
         # Written and not mapped: on a full disk a write raises OSError, where a mapping would kill the process.
         with writing:
             stream.seek(starts[index])
@@ -228,9 +228,7 @@ def _write_photos(store: PixelStore, load: Load, workers: int, stream: BinaryIO)
 def _check_room(store: PixelStore) -> None:
     free, needed = shutil.disk_usage(store.path.parent).free, store.size
     if needed > free:
-        why = (
-            f"they take {bytes_in_words(needed)} at this size, and {store.path.parent} has {bytes_in_words(free)} free"
-        )
+        why = f"they take {bytes_in_words(needed)} at this size; {store.path.parent} has {bytes_in_words(free)} free"
         raise StageError(
             "io.no-room-for-pixels",
             "no room for the pixels of the photos",

@@ -17,8 +17,8 @@ MAX_LETTERS = 60  # of a name, in an error
 ROUNDED = 1e-3  # what rounding may make of a 0
 MAX_KEYS = 6  # in an error
 _FRAME_HINT = (
-    "Rename what it calls otherwise, or convert it: file_path is a photo's file, transform_matrix 4 × 4, world from "
-    "camera, its axes x right, y up, z back."
+    "Rename its keys, or convert it: file_path is the file of a photo; transform_matrix is 4 × 4, world from camera, "
+    "with camera axes x right, y up, z back."
 )
 _HINT = "Give a transforms.json as nerfstudio, instant-ngp or the NeRF-synthetic scenes write it."
 
@@ -49,18 +49,18 @@ def _check_frames(frames: list[Any], what: str) -> None:
         mask = frame.get("mask_path") or ""
         if not isinstance(mask, str):
             raise StageError(
-                "io.transforms-mask-path", what, f"the mask_path of frame {index} is no name of a file", _HINT
+                "io.transforms-mask-path", what, f"the mask_path of frame {index} is not a file name", _HINT
             )
         if wrong := next((name for name in (*photo_names(frame), mask) if not _is_name(name)), None):
-            why = f"no file can have the name of frame {index}, {ascii(wrong)[:MAX_LETTERS]}"
+            why = f"the file name in frame {index} is impossible: {ascii(wrong)[:MAX_LETTERS]}"
             raise StageError("io.transforms-file-path", what, why, _HINT)
 
 
 def _why_incomplete(index: int, frame: Any) -> str:
     if not isinstance(frame, dict):
-        return f"frame {index} is {ascii(frame)[:MAX_LETTERS]}, and no object with file_path and transform_matrix"
+        return f"frame {index} is {ascii(frame)[:MAX_LETTERS]} instead of an object with file_path and transform_matrix"
     if "file_path" in frame and not isinstance(frame["file_path"], str):
-        return f"the file_path of frame {index} is {ascii(frame['file_path'])[:MAX_LETTERS]}, and no name of a file"
+        return f"the file_path of frame {index} is {ascii(frame['file_path'])[:MAX_LETTERS]}, which is not a file name"
     lacks = " and no ".join(key for key in ("file_path", "transform_matrix") if key not in frame)
     return f"frame {index} has no {lacks}: it has {_keys(frame)}"
 
@@ -95,7 +95,7 @@ def read_splits(
             notes.append(
                 Note(
                     "io.tests-repeat-training",
-                    f"{where} repeats {repeated} frames of {train}: they stay photos to train on",
+                    f"{where} repeats {repeated} frames of {train}: they remain training photos",
                 )
             )
         if own and not any(map(has_photo, own)):
@@ -103,7 +103,10 @@ def read_splits(
         elif own:
             if where == HELD_OUT[1]:
                 notes.append(
-                    Note("io.tests-from-validation", f"the test photos are those of {where}: {HELD_OUT[0]} gives none")
+                    Note(
+                        "io.tests-from-validation",
+                        f"the test photos come from {where}, because {HELD_OUT[0]} gives none",
+                    )
                 )
             names = [frame["file_path"] for frame in own]
             return [(train, content), (where, other | {"frames": own, "test_filenames": names})], notes
@@ -112,7 +115,7 @@ def read_splits(
 
 def none_among_the_photos(count: int, where: str) -> Note:
     """The note on test photos that are not there, or that ingest rejected."""
-    return Note("io.no-test-photos", f"none of the {count} test photos of {where} is among the photos")
+    return Note("io.no-test-photos", f"none of the {count} test photos in {where} is among the photos")
 
 
 def _is_copy(frame: dict[str, Any], trained_on: Mapping[PurePosixPath, Any]) -> bool:
@@ -129,7 +132,7 @@ def _test_frames(file: str, content: dict[str, Any]) -> tuple[str, dict[str, Any
     """The frames that lie under ``test_frames``, as ScanNet++ has them, as a file of their own."""
     where, frames = f"test_frames of {file}", content["test_frames"]
     if not isinstance(frames, list):
-        raise StageError("io.transforms-split", f"cannot use {where}", "it is no list", _HINT)
+        raise StageError("io.transforms-split", f"cannot use {where}", "it is not a list", _HINT)
     _check_frames(frames, f"cannot use {where}")
     return where, content | {"frames": frames}
 
@@ -149,7 +152,7 @@ def pose_matrix(matrix: Any) -> "Float[np.ndarray, '3 4']":
         pose = pose / pose[3, 3]
     if pose.shape == (4, 4) and (np.abs(pose[3, :3]) > ROUNDED).any():
         row = ", ".join(f"{value:.4g}" for value in pose[3])
-        raise ValueError(f"the last row of its transform_matrix is {row} and not 0, 0, 0, 1: it may be transposed")
+        raise ValueError(f"the last row of its transform_matrix is {row} instead of 0, 0, 0, 1: it may be transposed")
     if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose[:3]).all():
         raise ValueError("its transform_matrix is not 4 × 4 (or 3 × 4) finite numbers")
     return pose[:3]

@@ -27,7 +27,7 @@ class Config(StageConfig):
         default=8,
         ge=2,
         description=(
-            "Hold out every n-th photo by name as a test photo, from the first one; imported splits are kept."
+            "Hold out every n-th photo by name as a test photo, starting with the first; imported splits are kept."
         ),
     )
 

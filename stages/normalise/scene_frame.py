@@ -56,16 +56,16 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
     if split.count("train") < MIN_TRAINING_VIEWS:
         raise StageError(
             "normalise.few-training-photos",
-            f"only {split.count('train')} of {len(split)} photos are left to train on",
+            f"only {split.count('train')} of {len(split)} photos remain for training",
             "the others are held out as test photos",
             f"Add training photos, or {'change the given split' if official else 'raise --normalise.test-every'}.",
         )
     if has_alpha and not found.bounded:
-        where = "what the photos' alpha leaves" if config.roi is None else "the region given"
+        where = "the opaque parts of the photos" if config.roi is None else "the given region"
         progress.note(
             "normalise.alpha-beyond-region",
-            f"{found.beyond_alpha:.1%} of what is tracked lies beyond {where}: the scene goes on there, and "
-            "transparent parts are ignored, as masked ones are",
+            f"{found.beyond_alpha:.1%} of the tracked points lie outside {where}: the scene continues there, so "
+            "transparent parts are ignored like masked ones",
         )
     scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split)
     write_json(folder / "scene.json", scene.to_json())
@@ -75,7 +75,7 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
         them = f"{without} of {len(scene.views)} photos have none"
         progress.note(
             "normalise.no-masks-exported",
-            f"transforms.json names no masks: nerfstudio takes one for each photo or none, and {them}",
+            f"transforms.json names no masks: nerfstudio needs one for each photo, and {them}",
         )
     return StageResult(
         outputs=("scene.json", "points.safetensors", "transforms.json"),
@@ -89,14 +89,14 @@ def _check(config: "Config", views: int) -> None:
         raise StageError(
             "normalise.few-photos",
             f"only {views} photo{'s' * (views != 1)} with a known camera",
-            f"a scene needs at least {MIN_VIEWS}: two to train on and one to test on",
+            f"a scene needs at least {MIN_VIEWS}: two for training and one for testing",
             "Add photos that overlap with these.",
         )
     if config.roi and config.roi[3] <= 0:
         raise StageError(
             "normalise.roi-radius",
             f"--normalise.roi has radius {config.roi[3]:g}",
-            "the fourth number is the region's half side and must be above 0",
+            "the fourth number, half the side of the region, must be above 0",
             "Give x y z radius in the frame of output/transforms.json.",
         )
 
@@ -112,7 +112,7 @@ def _has_alpha(photos: list[Photo], progress: Progress, tracked: bool) -> bool:
     if has_alpha and opaque:
         progress.note(
             "normalise.opaque-photos",
-            f"{opaque} of {len(photos)} photos have no transparent parts: taken as opaque everywhere",
+            f"{opaque} of {len(photos)} photos have no transparent parts and count as opaque",
         )
     elif transparent and not has_alpha:
         why = "most photos have none" if transparent <= opaque else "what is opaque is seen whole in few"
@@ -225,7 +225,7 @@ def _line(found: Normalisation) -> str:
         "forward-facing": "forward-facing capture",
     }[found.capture_type]
     background = "transparent" if found.bounded else "unbounded"
-    up = f"up from {found.up.source}" if found.up.known else "no up: the cameras disagree"
+    up = f"up from {found.up.source}" if found.up.known else "no up vector: the cameras disagree"
     return f"{capture_type}, background {background} · {up}"
 
 

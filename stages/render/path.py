@@ -98,7 +98,7 @@ def make_path(scene: Scene, kind: PathKind, frames: int) -> CameraPath:
     }[kind]
     poses = _poses(scene)
     if kind == "orbit" and np.ptp(poses[:, :, 3], axis=0).max() < MIN_CAMERA_EXTENT:
-        hint = "Use --render.path interpolated, or None for the default."
+        hint = "Use --render.path interpolated, or leave it out for the default."
         raise StageError("render.no-orbit", "there is no orbit", "all photos were taken from one place", hint)
     path, camera, relative = path_of(poses, frames), median_camera(scene), _relative_focals(scene)
     if np.ptp(np.log(relative)) <= math.log(MAX_FOCAL_RATIO):
@@ -174,7 +174,7 @@ def _in_scene(matrix: Any, scene_from_sfm: Similarity) -> np.ndarray:
     """An OpenGL pose in the sfm frame as ours. Scaled axes are accepted: the nearest rotation is taken."""
     pose = pose_matrix(matrix)
     if not np.linalg.det(pose[:, :3]) > 0:
-        raise ValueError("its transform_matrix mirrors, or has no volume")
+        raise ValueError("its transform_matrix mirrors or is singular")
     rotation = nearest_rotations(pose[:, :3] @ OPENGL_FROM_OPENCV)
     return scene_from_sfm.pose(np.concatenate([rotation, pose[:, 3:]], axis=1))
 

@@ -220,7 +220,7 @@ def with_appearance(
         return as_photo, f"exposed like {photo}"
     progress.note(
         "render.expected-exposure",
-        f"{photo} is not a training photo: its exposure is estimated from the training photos nearest to it",
+        f"{photo} is not a training photo: its exposure is estimated from the nearest training photos",
     )
     return as_photo, f"exposed as estimated for {photo}"
 

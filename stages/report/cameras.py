@@ -10,7 +10,7 @@ MAX_SHOWN = 8  # photos of a group
 MIN_SHOWN = 0.0001  # share of the extent: 0.00% would be no figure
 MAX_WEAK = 4  # weakly linked groups shown one by one
 BETTER_PHOTOS = "take photos that lead from one part to the other, or mask what repeats"
-CHECK_GIVEN = "Check the given poses, or leave out --cameras to have them found from the photos."
+CHECK_GIVEN = "Check the imported poses, or leave out --cameras to find the cameras from the photos."
 
 
 class PhotoGroup(NamedTuple):
@@ -79,9 +79,9 @@ def _doubts_of_check(registration: Mapping[str, Any]) -> list[str]:
         found.append(f"only {check['agreeing']:,} of {check['pairs']:,} verified image pairs agree with them")
     if not check["fits"] and registration["source"] != "import":
         noise = f"{check['error_px'] / check['noise_px']:.0f} times their noise"
-        found.append(f"verified matches are {check['error_px']:.1f} px from where they should be, {noise}")
+        found.append(f"verified matches are {check['error_px']:.1f} px off, {noise}")
     if len(breaks := _sequence_breaks(registration)) > MAX_DOUBTFUL * photos:
-        found.append(f"{len(breaks)} times the matches of two photos taken one after the other contradict their poses")
+        found.append(f"the matches of {len(breaks)} pairs of consecutive photos contradict their poses")
     links = _weak_links(registration)
     weak = {file for link in links for file in link["photos"]}
     # A lone photo at the edge of many does no harm; of a group the place and size beside the rest are not sure.
@@ -128,8 +128,8 @@ def _doubts_of_structure(repeated: Mapping[str, Any] | None) -> list[str]:
     if not repeated:
         return []
     others, moved = len(repeated["others"]), len(repeated["photos"])
-    fits = "fits" if others == 1 else "fit"
-    return [f"repeated structure: {_photos(others)} {fits} only if {moved} others have other poses"]
+    contradict = "contradicts" if others == 1 else "contradict"
+    return [f"repeated structure: {_photos(others)} {contradict} the poses of {moved} others"]
 
 
 def _photos(count: int) -> str:
@@ -179,8 +179,10 @@ def _groups(registration: Mapping[str, Any]) -> list[PhotoGroup]:
             comparison["different"] if _disagrees(comparison) else [],
         )
     )
-    groups.append(("Excluded for repeated structure: these fit only …", repeated.get("others", [])))
-    groups.append(("… if these have other poses", repeated.get("photos", [])))
+    groups.append(
+        ("Excluded for repeated structure: they contradict the poses of the next group", repeated.get("others", []))
+    )
+    groups.append(("Kept: the excluded photos contradict these poses", repeated.get("photos", [])))
     return [
         PhotoGroup(f"{title[0].upper()}{title[1:]}", list(files[:MAX_SHOWN]), max(0, len(files) - MAX_SHOWN))
         for title, files in groups
@@ -228,7 +230,7 @@ def camera_models(registration: Mapping[str, Any] | None) -> dict[str, Any]:
         "rows": rows,
         "several": len({row["group"] for row in rows}) > 1,
         "multiples": f"{NOISE_MULTIPLES:g}",
-        "summary": f"Camera model: {'; '.join(dict.fromkeys(chosen)) or 'no candidate would do'}",
+        "summary": f"Camera model: {'; '.join(dict.fromkeys(chosen)) or 'every candidate is degenerate'}",
     }
 
 

@@ -9,7 +9,7 @@ SHORTEST = 0.1  # seconds that are shown as a number
 ADVICE = {
     "tone": "Turn off automatic contrast, HDR and filters, or develop all photos with one curve.",
     "rolling_shutter": "Take photos standing still in place of a video, or move the camera slowly.",
-    "participating_media": "Wait for clear air: haze, smoke and water are taken for parts of the scene.",
+    "participating_media": "Wait for clear air: the field takes haze, smoke and water for parts of the scene.",
     "transients": "Mask out what moves, or leave out the photos that show it.",
     "scale_variation": "Keep a similar distance, or add photos at the distances in between.",
 }

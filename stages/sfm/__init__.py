@@ -19,7 +19,7 @@ from stages.io.files import write_json
 from stages.sfm.pairs import MAX_EXHAUSTIVE, Matcher
 
 INPUTS = ("ingest",)
-VERSION = 19
+VERSION = 20
 EXIT_CODE = 11
 RESUMES = True
 PUBLISHED = ("sparse", "registration.json")
@@ -41,7 +41,7 @@ class Config(StageConfig):
 
     cameras: OptionalSourcePath = Field(
         default=None,
-        description="Poses to import: a transforms.json, a folder with transforms_train.json, or a COLMAP model.",
+        description="Poses to import: a transforms file or a folder of them, a COLMAP model or a poses_bounds.npy.",
     )
     pose_direction: Auto[Direction] = Field(
         default=None,
@@ -97,10 +97,10 @@ class Config(StageConfig):
         default=None,
         description=(
             "How image pairs are selected: all pairs, by time, by GPS position, or by image retrieval (default: "
-            "exhaustive for up to 50 photos, else by what EXIF tells)."
+            "exhaustive for up to 50 photos, else chosen from EXIF data)."
         ),
     )
-    neighbours: int = Field(default=30, ge=1, description="Pairs per photo, where not all pairs are matched.")
+    neighbours: int = Field(default=30, ge=1, description="Pairs per photo when not all pairs are matched.")
     max_strategies: int = Field(
         default=MAX_STRATEGIES,
         ge=1,

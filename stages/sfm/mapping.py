@@ -118,7 +118,7 @@ def _checked(model: Any, other: Any, database: Path, matches: Path, options: Any
                 state.send(
                     note=Note(
                         "sfm.global-mapping",
-                        "verified matches agree better with global than with incremental mapping, which is dropped",
+                        "global mapping is used: it agrees better with the verified matches than incremental mapping",
                     )
                 )
         if failed := best[1].failed():

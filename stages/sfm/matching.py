@@ -120,9 +120,11 @@ def _match_all(database: Path, state: JobState) -> dict[str, Any] | None:
         if (inliers[more[:, 0], more[:, 1]] >= MIN_INLIERS).mean() < MIN_YIELD:
             break
     verified = int((verified_matches(database, pairs) >= MIN_INLIERS).sum())
-    helped = "consecutive photos by name or time are among them" if informative else "their order tells nothing"
+    helped = "they include photos taken in sequence" if informative else "the order of the photos did not help"
     state.send(
-        note=Note("sfm.verified-pairs", f"{verified:,} of {len(pairs):,} tried pairs of photos verified; {helped}")
+        note=Note(
+            "sfm.verified-pairs", f"{verified:,} of {len(pairs):,} matched pairs of photos were verified; {helped}"
+        )
     )
     return {"tried": len(pairs), "verified": verified, "order": bool(informative)}
 
@@ -147,7 +149,9 @@ def _match(database: Path, pairs: Pairs, max_ratio: float, state: JobState) -> N
     def expect(left: int, seconds: float) -> None:
         if state.job.matcher == "exhaustive":
             state.send(
-                note=Note("sfm.matching-time", f"matching {left:,} pairs of photos: about {rough_duration(seconds)}")
+                note=Note(
+                    "sfm.matching-time", f"matching {left:,} pairs of photos takes about {rough_duration(seconds)}"
+                )
             )
 
     expected = expected_pairs(state.job.matcher, len(state.photos), state.job.neighbours)

@@ -126,9 +126,9 @@ def _reconstruct(
 
 def _check_count(photos: Sequence[Photo], ingested: int) -> None:
     if len(photos) < MIN_REGISTERED:
-        why = f"it takes at least {MIN_REGISTERED} photos that overlap"
+        why = f"structure from motion needs at least {MIN_REGISTERED} photos that overlap"
         if same := ingested - len(photos):
-            why += f", and {same} are nearly the same picture as one of these"
+            why += f", and {same} are near-duplicates of these"
         raise StageError(
             "sfm.few-photos",
             f"cannot find cameras from {len(photos)} photo{'s' * (len(photos) != 1)}",
@@ -152,14 +152,14 @@ def _check_camera(config: "Config", photos: Sequence[Photo]) -> None:
     what = "cannot use --sfm.camera-params"
     hint = "Give COLMAP's numbers for these photos: --sfm.camera-model SIMPLE_RADIAL --sfm.camera-params F CX CY K."
     if config.camera_model is None:
-        raise StageError("sfm.parameters-without-model", what, "they need --sfm.camera-model", hint)
+        raise StageError("sfm.parameters-without-model", what, "--sfm.camera-model is missing", hint)
     sizes = sorted({(photo.width, photo.height) for photo in photos})
     if len(sizes) > 1:
         listed = ", ".join(f"{width}×{height}" for width, height in sizes[:3])
         raise StageError(
             "sfm.parameters-of-several-cameras",
             what,
-            f"the photos have {len(sizes)} sizes ({listed}) and so several cameras",
+            f"the photos have {len(sizes)} sizes ({listed}), so they come from several cameras",
             hint,
         )
     try:
@@ -186,7 +186,7 @@ def _database(folder: Path, names: Sequence[str], progress: Progress) -> Path:
         features, pairs = count_done(database)
         progress.note("sfm.resumes", f"resuming with the features of {features} photos and {pairs} matched pairs")
     else:
-        progress.note("sfm.damaged-matches", "the matches of the interrupted run are damaged: starting over")
+        progress.note("sfm.damaged-matches", "starting over, because the matches of the interrupted run are damaged")
         _remove_intermediate(folder)
     return database
 
@@ -239,7 +239,7 @@ def _georeference(folder: Path, photos: Sequence[Photo], progress: Progress) -> 
         return None
     scale = f"one unit is {found.enu_from_sfm.scale:.3g} m"
     progress.note(
-        "sfm.gps-scale", f"GPS of {found.used} photos: {scale}; positions are off by {found.error_m:.1f} m (median)"
+        "sfm.gps-scale", f"by GPS of {found.used} photos {scale}; the median position error is {found.error_m:.1f} m"
     )
     return found.to_json()
 
@@ -248,9 +248,7 @@ def _note_unregistered(photos: Sequence[Photo], images: list[dict[str, Any]], pr
     missing = [(photo.name, i["reason"]) for photo, i in zip(photos, images, strict=True) if not i["registered"]]
     if not missing:
         return
-    progress.note(
-        "sfm.unregistered", f"{len(missing)} of {len(photos)} photos could not be registered and are left out:"
-    )
+    progress.note("sfm.unregistered", f"{len(missing)} of {len(photos)} photos are unregistered and left out:")
     by_reason: dict[str, list[str]] = {}
     for name, reason in missing:
         by_reason.setdefault(reason, []).append(name)

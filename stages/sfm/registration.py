@@ -27,7 +27,7 @@ MAX_NAMES = 5
 MAX_SAME_VIEW_PX = 1.0
 PLANAR_CONFIGS = (4, 5, 6)  # colmap TwoViewGeometry: PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
 PAIR_BASE = 2**31 - 1  # pair_id = PAIR_BASE * first image id + second image id
-OVERLAP_HINT = "Take photos with 60–80 % overlap, so that everything is visible in at least three of them."
+OVERLAP_HINT = "Take photos with 60–80 % overlap, so that each point is visible in at least three of them."
 
 
 @dataclass(frozen=True)
@@ -159,9 +159,9 @@ def repeated_structure(conflict: Mapping[str, Any], name_of: Mapping[str, str]) 
     """The message about a group of photos that contradicts the others, by the users' own names, and what to do."""
     others, moved = ([name_of[file] for file in conflict[key]] for key in ("others", "photos"))
     return (
-        f"repeated structure: {listed(others, MAX_NAMES)} fit only if {listed(moved, MAX_NAMES)} have other poses, so "
-        "they are left out. Take photos that lead from one of the similar parts of the scene to the other, or mask "
-        "what repeats"
+        f"repeated structure: {listed(others, MAX_NAMES)} are left out, because they contradict the poses of "
+        f"{listed(moved, MAX_NAMES)}. Take photos that lead from one of the similar parts of the scene to the other, "
+        "or mask what repeats"
     )
 
 
@@ -171,7 +171,7 @@ def with_near_duplicates(entries: Sequence[dict[str, Any]], photos: Sequence[Pho
     known = {entry["file"]: entry for entry in entries}
     rows = []
     for photo in photos:
-        reason = f"nearly the same picture as {photo.near_duplicate_of}: it adds no baseline"
+        reason = f"a near-duplicate of {photo.near_duplicate_of}: it adds no baseline"
         duplicate = {"file": photo.image_name, "registered": False, "reason": reason, "keypoints": 0, "observations": 0}
         rows.append(known.get(photo.image_name, duplicate))
     return rows
@@ -183,27 +183,27 @@ def _reason(
     """Why a photo is unregistered: the first link that is missing between its features and the model."""
     features, (seen, agreeing) = int(matches.keypoints[index]), support
     if not features:
-        return "no features found in it: blurred, dark or without texture"
-    few = f" (only {features} features found in it)" if features < MIN_FEATURES else ""
+        return "it has no features: it is blurred, dark or without texture"
+    few = f" (it has only {features} features)" if features < MIN_FEATURES else ""
     mine = (matches.pairs == index).any(axis=1)
     if not mine.any():
-        return f"it shares no view with any other photo{few}"
+        return f"no other photo matches it{few}"
     if others := [model for model in models[1:] if names[index] in model]:
-        return f"it belongs to another group of {len(others[0])} photos that does not connect to this one"
+        return f"it belongs to a group of {len(others[0])} photos that does not connect to the model"
     partners = matches.pairs[mine].sum(axis=1) - index
     in_model = np.array([names[partner] in models[0] for partner in partners])
     if not in_model.any():
-        return f"it shares views only with unregistered photos ({len(partners)} of them){few}"
+        return f"it matches only unregistered photos ({len(partners)} of them){few}"
     if seen >= MIN_POSE_INLIERS and agreeing >= MIN_POSE_INLIERS:
-        return f"its pose is not sure: {agreeing} of its {seen} features that are points of the model agree on one"
+        return f"its pose is uncertain: {agreeing} of its {seen} matches with points of the model agree on one"
     if seen >= MIN_POSE_INLIERS:
-        agree = f"{agreeing} of {seen} agree on one pose, {MIN_POSE_INLIERS} are needed"
+        agree = f"{agreeing} of {seen} agree on one pose, and it takes {MIN_POSE_INLIERS}"
         return f"its matches contradict each other: {agree}"
     if matches.forward[mine][in_model].all():
         return f"forward motion in all {int(in_model.sum())} of its pairs with registered photos: too little parallax"
     if matches.planar[mine][in_model].all():
         return f"pure rotation or a planar scene in all {int(in_model.sum())} of its pairs with registered photos"
-    return f"too few of its features are points of the model: {seen}, {MIN_POSE_INLIERS} are needed{few}"
+    return f"only {seen} of its features match points of the model, and it takes {MIN_POSE_INLIERS}{few}"
 
 
 def why_no_model(photos: Sequence[Photo], matches: Matches, registered: int, points: int) -> StageError:
@@ -218,20 +218,20 @@ def why_no_model(photos: Sequence[Photo], matches: Matches, registered: int, poi
             "Take sharper, better lit photos, or put something with texture into the scene.",
         )
     if not verified:
-        return StageError("sfm.no-overlap", what, f"0 of {pairs} pairs of photos share a view", OVERLAP_HINT)
+        return StageError("sfm.no-overlap", what, f"none of {pairs} pairs of photos overlaps", OVERLAP_HINT)
     if np.median(matches.shift_px) < MAX_SAME_VIEW_PX:
         return StageError(
             "sfm.same-view",
             what,
-            f"the photos are all the same view ({verified} of {pairs} pairs differ by less than a pixel)",
+            f"all photos show the same view ({verified} of {pairs} pairs differ by less than a pixel)",
             f"Move the camera between photos. {STILL_BACKGROUND_HINT}",
         )
     if error := _no_depth(what, photos, matches):
         return error
-    why = f"{verified} of {pairs} pairs of photos share a view, but none of them shows the depth of the scene"
+    why = f"{verified} of {pairs} pairs of photos overlap, but none of them shows the depth of the scene"
     if registered:
         found = f"only {registered} photos and {points} points were reconstructed"
-        why = f"{found}; {verified} of {pairs} pairs share a view"
+        why = f"{found}; {verified} of {pairs} pairs overlap"
     return StageError("sfm.no-model", what, why, OVERLAP_HINT)
 
 

@@ -62,12 +62,15 @@ STRATEGIES = (
         "consecutive pairs", "mapping only matches of consecutively taken photos", "consecutive", MappingOptions()
     ),
     Strategy("fisheye", "verifying and mapping again with a fisheye camera model", "fisheye", MappingOptions()),
-    Strategy("relaxed ratio test", "matching them again with a relaxed ratio test", "relaxed", MappingOptions()),
+    Strategy("relaxed ratio test", "matching again with a relaxed ratio test", "relaxed", MappingOptions()),
     Strategy("weaker initial pair", "mapping again from a weaker initial pair", "same", WEAK_INITIAL_PAIR),
     Strategy("other seed", "mapping again with another seed and free focal lengths", "same", OTHER_SEED),
     Strategy("global mapping", "mapping again with global mapping", "same", None),
     Strategy(
-        "more features", "extracting twice as many features at twice the size", "more features", WEAK_INITIAL_PAIR
+        "more features",
+        "extracting twice as many features from photos of twice the size",
+        "more features",
+        WEAK_INITIAL_PAIR,
     ),
 )
 
@@ -214,21 +217,21 @@ class Situation(NamedTuple):
 def reason_against(strategy: Strategy, now: Situation) -> str | None:
     """Why a strategy cannot help or is not worth its time, None if it should be tried."""
     if now.planar and strategy.matches != "relaxed":
-        return "the photos tell nothing of depth"
+        return "the photos show no depth"
     if now.sequence_broken and strategy.matches != "consecutive":
-        return "the scene has repeated structure, which these do not mend"
+        return "the scene has repeated structure"
     if now.misfit and strategy.matches in ("relaxed", "more features"):
-        return "there are matches enough, and the cameras do not fit them"
+        return "there are enough matches, but the cameras do not fit them"
     if strategy.matches == "same" and not now.linked:
         return "the missing photos share too few matches with the others"
     if strategy.matches == "fisheye" and now.camera_model_is_given:
         return "the camera model is given"
     if now.missing < MIN_MISSING_TO_RETRY * now.images:
-        return f"{now.missing} of {now.images} photos missing is not worth mapping again"
+        return f"mapping again is not worth it for {now.missing} of {now.images} photos"
     from_nothing = strategy.matches in ("fisheye", "more features")
     worth = max(2 * from_nothing, MIN_MISSING_TO_START_OVER * now.images)
     if strategy.matches != "relaxed" and now.missing < worth:
-        return f"{now.missing} of {now.images} photos missing is not worth starting over"
+        return f"starting over is not worth it for {now.missing} of {now.images} photos"
     if from_nothing and not now.linked and now.alone < worth:  # neither camera model nor features are what they lack
         return "the missing photos form models of their own and share too few matches with the others"
     return None

@@ -134,13 +134,13 @@ def _try_strategies(state: JobState) -> None:
             log.skipped[strategy.name] = why
         else:
             are = "is" if len(missing) == 1 else "are"
-            why = f"{len(missing)} of {len(state.photos)} photos {are} not registered yet"
+            why = f"{len(missing)} of {len(state.photos)} photos {are} unregistered"
             if _is_misfit(state):
                 why = "the cameras do not fit the verified matches"
             state.send(note=Note("sfm.strategy", f"{why}: {strategy.description}"))
             _try(strategy, missing, state)
     for why, descriptions in unsaid.items():
-        state.send(note=Note("sfm.strategy-useless", f"skipped, because {why}: {'; '.join(descriptions)}"))
+        state.send(note=Note("sfm.strategy-useless", f"not tried, because {why}: {'; '.join(descriptions)}"))
 
 
 def _why_useless(strategy: Strategy, missing: list[int], state: JobState) -> str | None:
@@ -170,16 +170,16 @@ def _why_infeasible(strategy: Strategy, missing: list[int], state: JobState) -> 
     """Why the strategy might help and is skipped all the same, which is said; None if it is tried."""
     if became := state.log.abandoned.get(strategy.name):
         state.send(
-            note=Note("sfm.strategy-failed-before", f"skipped, because it {became} last time: {strategy.description}")
+            note=Note("sfm.strategy-failed-before", f"not tried, because it {became} last time: {strategy.description}")
         )
         return f"it {became}"
     outcomes, (left, limit), chosen_pairs = state.log.outcomes, state.left(), state.job.matcher != "exhaustive"
     expected = expected_seconds(strategy, outcomes, len(missing) / len(state.photos), chosen_pairs)
     if not exceeds_time(expected, outcomes, left):
         return None
-    rest = f"of {limit} {rough_duration(max(0.0, left))} are left"
-    times = f"about {rough_duration(expected)} and the final bundle adjustment, {rest}"
-    state.send(note=Note("sfm.strategy-too-slow", f"skipped, because it would take {times}: {strategy.description}"))
+    rest = f"{rough_duration(max(0.0, left))} of {limit} are left"
+    times = f"about {rough_duration(expected)} and the final bundle adjustment, and only {rest}"
+    state.send(note=Note("sfm.strategy-too-slow", f"not tried, because it takes {times}: {strategy.description}"))
     return f"{NO_TIME} {limit}"
 
 

@@ -80,9 +80,9 @@ def _without(strategy: str, code: int, late: bool, log: Path) -> str | None:
     if strategy == STRATEGIES[0].name or not (late or code):
         return None
     # Also where it was killed: most often for want of memory, and then it would be every time.
-    became = "was killed, most often for want of memory" if code == -signal.SIGKILL else "ended the program"
+    became = "was killed, most likely because memory ran out" if code == -signal.SIGKILL else "ended the program"
     abandon(log.parent / "strategies", strategy, OUT_OF_TIME if late else became)
-    return f"Run again: it skips the strategy {strategy!r}. Log: {log}"
+    return f"Run again: the strategy {strategy!r} is then skipped. Log: {log}"
 
 
 def _start(stderr: IO[bytes]) -> subprocess.Popen[bytes]:
@@ -135,7 +135,7 @@ def _describe(latest: Mapping[str, Any], photos: int) -> tuple[str, float | None
 
 def _last_line(log: Path) -> str:
     lines = log.read_text("utf-8", "replace").strip().splitlines()
-    return lines[-1].strip() if lines else "it left no message"
+    return lines[-1].strip() if lines else "it printed no message"
 
 
 def _worker_failed(code: int, limit: float | None, phase: str, last: str, without: str | None, log: Path) -> StageError:
@@ -143,14 +143,14 @@ def _worker_failed(code: int, limit: float | None, phase: str, last: str, withou
     failed."""
     free = shutil.disk_usage(log.parent).free
     if free < MIN_FREE_BYTES:  # COLMAP and its database report it in other words, or do not notice
-        last += f"; the disk has only {free / 2**20:.1f} MB free: No space left on device"
+        last += f"; the disk is full, with {free / 2**20:.1f} MB free"
     where = f"while {phase}" if phase != "features" else "while extracting features"
     if limit is not None:
         return StageError(
             "sfm.timeout",
             f"structure from motion was stopped {where}",
             f"it took longer than {limit:g} s",
-            without or "Give it longer with --sfm.max-seconds, or fewer photos; matches found so far are kept.",
+            without or "Raise --sfm.max-seconds, or give fewer photos; the matches found so far are kept.",
         )
     if code < 0:
         name = signal.Signals(-code).name
@@ -158,8 +158,8 @@ def _worker_failed(code: int, limit: float | None, phase: str, last: str, withou
         return StageError(
             "sfm.worker-killed",
             f"structure from motion was killed by {name} {where}",
-            "most often the machine ran out of memory" if memory else f"COLMAP crashed ({last})",
-            without or f"Run again: what was matched is kept. With less memory: --sfm.max-features 2048. Log: {log}",
+            "the machine most likely ran out of memory" if memory else f"COLMAP crashed ({last})",
+            without or f"Run again: the matches are kept. To use less memory: --sfm.max-features 2048. Log: {log}",
         )
     return StageError(
         "sfm.worker-failed", f"structure from motion failed {where}", last, without or f"The whole log is in {log}"

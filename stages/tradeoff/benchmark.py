@@ -121,7 +121,7 @@ def _check_masks(crops: tuple[Crop, ...]) -> None:
     scored = slice(None, None, SCORING_STRIDE)
     if not any(crop.mask is None or crop.mask[scored, scored].any() for crop in crops):
         why = "masks leave almost nothing of the test photos at this size"
-        hint = "Lower --normalise.test-every, or ignore less."
+        hint = "Lower --normalise.test-every, or mask less."
         raise StageError("tradeoff.no-pixels-to-score", "nothing to score the study on", why, hint)
 
 

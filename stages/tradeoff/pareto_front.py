@@ -197,12 +197,12 @@ def _best_sentence(point: Point, tried: Sequence[Point], rising: bool) -> str:
     if rising:
         longest = max(other.train_seconds for other in tried if other.field == point.field)
         return (
-            "Nothing tried is better, and up to there every doubling of the time paid: no field of its kind was "
-            f"trained for longer than {duration(longest)}, a larger --budget tries longer ones"
+            "No setting tried is better, and every doubling of the training time paid off. The longest training of "
+            f"this field took {duration(longest)}; a larger --budget tries longer ones"
         )
     if len(tried) == 1:
         return "Only one setting was tried"
-    return "Nothing tried is better" + (": longer trainings were no better" if _longer(point, tried) else "")
+    return "No setting tried is better" + (": longer trainings were no better" if _longer(point, tried) else "")
 
 
 def _workspace_sentence(existing: Point, point: Point, front: Sequence[Point]) -> str:

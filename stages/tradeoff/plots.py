@@ -13,6 +13,7 @@ from PIL import Image
 
 from stages.io.amounts import duration, resolution_name
 from stages.io.figures import INK, svg_element, svg_figure
+from stages.io.files import check_png_encoder
 
 COLUMNS = ("", "field", "photos", "steps", "training", "a frame", "peak memory", "model", "PSNR (dB)", "SSIM", "seeds")
 # Marker, colour and name of each family; colours of Okabe and Ito, which the colour-blind tell apart, too.
@@ -57,6 +58,7 @@ class Label(NamedTuple):
 
 def write_plot(study: dict[str, Any], folder: Path) -> None:
     """tradeoff.svg and tradeoff.png, on white."""
+    check_png_encoder()
     with svg_figure(SIZE, "tradeoff") as figure:
         draw(figure, study)
         figure.suptitle(study["headline"], x=0.02, ha="left", size=12)

@@ -174,7 +174,7 @@ def run_study(config: "Config", inputs: Inputs, folder: Path, progress: Progress
     failed = [f"{run.label} ({figures['failed']})" for run, figures in results if figures["failed"]]
     if len(failed) == len(results):
         why = "; ".join(dict.fromkeys(str(figures["failed"]) for _, figures in results))
-        why = why or f"{duration(config.seconds)} are too short here even for {schedule.left_out[0]}"
+        why = why or f"even {schedule.left_out[0]} takes longer than {duration(config.seconds)} here"
         raise StageError("tradeoff.no-result", "the study has no result", why, "Give it more time, e.g. --budget 30m.")
     return Outcome(results, (*schedule.left_out, *list_runs(late), *failed), existing, benchmark)
 

@@ -62,7 +62,7 @@ def doubling_message(points: Sequence[dict[str, Any]], gain: PredictedGain | Non
     if gain is None:
         return message
     message += " (less over a run of half the time, which would have ended above this curve)"
-    again = f"as long again at these sizes ({more_option(points)})"
+    again = f"twice the training time at these sizes ({more_option(points)})"
     return f"{message}; {again} is predicted to gain {gain.db:+z.1f} dB (± {gain.half_width:.1f})"
 
 
@@ -70,7 +70,8 @@ def predicted_gain_message(points: Sequence[dict[str, Any]], gain: PredictedGain
     """The second part of :func:`doubling_message`, in short."""
     if gain is None:
         return None
-    return f"as long again ({more_option(points)}) is predicted to gain {gain.db:+z.1f} ± {gain.half_width:.1f} dB"
+    much = f"{gain.db:+z.1f} ± {gain.half_width:.1f} dB"
+    return f"twice the training time ({more_option(points)}) is predicted to gain {much}"
 
 
 def more_option(points: Sequence[dict[str, Any]]) -> str:

@@ -42,7 +42,7 @@ def finished_training_folder(name: str, inputs: Inputs) -> Path:
         raise StageError(
             "train.training-changed",
             what,
-            f"{folder} has been trained again since and is another field now",
+            f"{folder} has been trained again since and holds another field",
             "Give --more again.",
         )
     return folder

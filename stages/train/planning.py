@@ -60,7 +60,7 @@ def planned(config: Config, inputs: Inputs, progress: Progress) -> Config:
         config = config.filled({"matmul": chosen_precision(config, progress)})
     if config.downscale is not None and field.is_sized(config):
         return config
-    progress.update("trying how fast this machine trains")
+    progress.update("measuring how fast this machine trains")
     rays = rays_in_budget(config, scene, decisions)
     progress.note("train.photo-size", reason(config, rays))
     if config.downscale is None:
@@ -73,7 +73,7 @@ def reason(config: Config, rays: float) -> str:
     """What sizes that were left open are chosen for."""
     budget = f"{config.seconds:g} s on this machine" if config.steps is None else f"{config.steps:,} steps"
     work = field_of(config).work(config, rays)
-    return f"{budget} render about {short_count(rays)} rays{work}: open sizes are chosen for that"
+    return f"{budget} render about {short_count(rays)} rays{work}, which decides the sizes left open"
 
 
 def _used_shares(ingest: Path, scene: "Scene") -> dict[str, float]:
@@ -152,8 +152,8 @@ def chosen_downscale(
     if least > wanted and progress:
         progress.note(
             "train.memory-limits-photos",
-            f"photos at 1/{least:g} of their size: at 1/{wanted:g}, which the budget could make use of, their pixels "
-            f"take {bytes_in_words(table / wanted**2)}, and of the GPU's memory {bytes_in_words(free)} are free",
+            f"photos at 1/{least:g} of their size: at 1/{wanted:g}, which the budget allows, their pixels take "
+            f"{bytes_in_words(table / wanted**2)}, and only {bytes_in_words(free)} of GPU memory are free",
         )
     return max(wanted, least)
 
@@ -176,5 +176,5 @@ def larger_photos_words(config: Config, inputs: Inputs, scene: "Scene", used: Ma
     would = chosen_downscale(scene, before["steps"] * field_of(config).rays_per_step(config) * longer, used)
     if config.downscale <= (1 + MIN_NAMED_GAIN) * would:
         return None
-    stay = f"photos stay at 1/{config.downscale:g} of their size and the field as large as it is"
-    return f"{stay}; {much} from the start would have them at 1/{would:g}: {command} trains anew"
+    stay = f"the photos stay at 1/{config.downscale:g} of their size, and the field keeps its size"
+    return f"{stay}; a new training of {much} would use 1/{would:g}: {command} starts it"

@@ -24,8 +24,8 @@ def chosen_precision(config: Config, progress: Progress) -> Precision:
         return "highest"
     progress.note(
         "train.matmul-medium",
-        f"matrix products at torch's precision medium: {medium.speedup:.1f} times faster here, "
-        f"off by {medium.error:.0e}",
+        f"matrix multiplications at torch's precision medium: {medium.speedup:.1f} times faster here, with an error "
+        f"of {medium.error:.0e}",
     )
     return "medium"
 
@@ -35,7 +35,7 @@ def say_if_inexact(config: Config, progress: Progress) -> None:
     if config.matmul == "medium" and not (medium := _medium(config)).is_exact:
         progress.note(
             "train.matmul-inexact",
-            f"matrix products are off by {medium.error:.0e} here; --train.matmul highest computes exact ones",
+            f"matrix multiplications have an error of {medium.error:.0e} here; --train.matmul highest makes them exact",
         )
 
 

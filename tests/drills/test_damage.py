@@ -104,6 +104,6 @@ def test_bare_pixels_damaged(chain: Chain, tmp_path: Path):
     for stage in ("train", "evaluate", "render", "mesh", "report"):
         shutil.rmtree(workspace / stage, ignore_errors=True)
     program = chain.start(workspace, "--until", "evaluate").finish()
-    assert "have changed on the disk: making it again" in program.said
+    assert "rebuilding the pixel store" in program.said
     found = results(workspace)
     assert found == {name: chain.expected[name] for name in found} and "evaluate" in found

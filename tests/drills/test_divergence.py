@@ -253,7 +253,7 @@ def test_a_float_photo_with_nan_is_refused_by_name(tmp_path: Path, poison: float
     values[3, 4] = poison
     Image.fromarray(values).save(tmp_path / "poisoned.tif")
     assert decode(tmp_path / "fine.tif").pixels.shape == (20, 30, 3)
-    with pytest.raises(DecodeError, match=r"^1 of its 600 pixels are no numbers \(NaN or infinite\)$"):
+    with pytest.raises(DecodeError, match=r"^1 of its 600 pixels are NaN or infinite$"):
         decode(tmp_path / "poisoned.tif")
 
 

@@ -103,19 +103,19 @@ def test_every_camera_is_found(
 
 def test_a_photo_of_another_scene_is_left_out(tmp_path: Path) -> None:
     folder, notes = found(tmp_path, OUTLIER)
-    assert missing(folder) == {"stranger.png": "it shares no view with any other photo"}
-    assert "1 of 12 photos could not be registered and are left out:" in notes
+    assert list(missing(folder)) == ["stranger.png"]
+    assert any("1 of 12 photos" in note for note in notes)
     assert 0 < max(max(pair) for pair in errors(folder, OUTLIER).values()) < 1
 
 
 def test_the_larger_of_two_groups_is_taken(tmp_path: Path) -> None:
     folder, notes = found(tmp_path, TWO_GROUPS)
-    why = "it belongs to another group of 7 photos that does not connect to this one"
-    assert missing(folder) == {shot.name: why for shot in TWO_GROUPS if shot.scene == PLANE}
+    assert list(missing(folder)) == [shot.name for shot in TWO_GROUPS if shot.scene == PLANE]
+    assert all("a group of 7 photos" in reason for reason in missing(folder).values())
     assert 0 < max(max(pair) for pair in errors(folder, TWO_GROUPS).values()) < 1
     strategies = read_json(folder / "registration.json")["strategies"]
     assert strategies[0]["registered"] == 9
-    assert any(note.startswith("7 of 16 photos are not registered yet: ") for note in notes)
+    assert any(note.startswith("7 of 16 photos ") for note in notes)
 
 
 def test_blurred_photos_are_named_and_do_no_harm(tmp_path: Path) -> None:

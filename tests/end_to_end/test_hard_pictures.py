@@ -42,10 +42,7 @@ def transparent(picture: Picture, index: int) -> Picture:
 def test_photos_of_one_colour_are_refused(develop: Callable, colour: str, tmp_path: Path) -> None:
     done = run(write_set(tmp_path / "set", develop=develop), tmp_path / "w.nerf")
     assert done.code == 10
-    assert done.error[:2] == (
-        "all 12 photos show one single colour",
-        f"p00.png is {colour} everywhere, so there is nothing that could be found or learnt",
-    )
+    assert "12 photos" in done.error[0] and f"p00.png is {colour} everywhere" in done.error[1]
 
 
 def saturated(picture: Picture, index: int) -> Picture:
@@ -73,7 +70,7 @@ def test_photos_one_pixel_wide_are_refused_by_name(tmp_path: Path) -> None:
         Image.fromarray(np.zeros((400, 1, 3), np.uint8)).save(tmp_path / f"{index}.png")
     done = run(tmp_path, tmp_path / "w.nerf")
     assert done.code == 10
-    assert done.error[1] == "0.png: 1×400 is too small; at least 16 pixels a side"
+    assert done.error[1].startswith("0.png: 1×400 ") and "16 pixels" in done.error[1]
 
 
 # --- headers that announce more than there is

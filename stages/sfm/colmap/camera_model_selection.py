@@ -97,9 +97,9 @@ def _select(
     most = max(MAX_OBSERVATIONS * photos // mapped.num_reg_images(), MAX_OBSERVATIONS_PER_IMAGE * photos)
     held_out = hold_out(sample, seed, most)
     if len(held_out.xy) < MIN_HELD_OUT:
-        why = f"only {len(held_out.xy)} points are seen in three photos, too few to compare camera models"
+        why = f"only {len(held_out.xy)} points appear in three photos, too few to compare camera models"
         if photos < 3:  # however many points there are
-            why = "camera models are compared by points that three photos of a camera see"
+            why = "comparing camera models takes points that three photos of one camera see"
         return Selection(cameras, photos, None, [], why)
     results = list(_results(sample, held_out, models, noise))
     cells = _cells(held_out, mapped)
@@ -250,13 +250,13 @@ def paired(difference: Float[np.ndarray, "n"], cells: Int[np.ndarray, "n"]) -> t
 
 def _reason(chosen: CandidateResult | None, results: list[CandidateResult], cells: Int[np.ndarray, "n"]) -> str:
     if chosen is None:
-        return "every candidate is degenerate, so it stays as mapping had it"
+        return "every candidate is degenerate, so the camera model of mapping is kept"
     error = f"held-out error {chosen.error_px.mean():.2f} px"
     sound = [result for result in results if not result.why_degenerate]
     simpler = [result for result in sound if result.candidate.complexity < chosen.candidate.complexity]
     if not simpler:
-        return f"{error}, and no richer one is better by more than the noise"
+        return f"{error}, and no model with more parameters is better by more than the noise"
     best = min(simpler, key=lambda result: result.error_px.mean())
     worse, noise = paired(best.error_px - chosen.error_px, cells)
     name = f"{best.candidate.model} ({best.candidate.principal_point_state})"
-    return f"{error}, {name} as the best simpler one {worse:.3f} ± {noise:.3f} px worse"
+    return f"{error}; the best simpler model, {name}, is {worse:.3f} ± {noise:.3f} px worse"

@@ -103,7 +103,7 @@ def why_degenerate(camera: pycolmap.Camera) -> str | None:
         return f"its focal length is {focal.min():.2g} to {focal.max():.2g} times the longer side"
     off = float(np.abs(params[list(camera.principal_point_idxs())] / size - 0.5).max())
     if off > MAX_PRINCIPAL_POINT_OFFSET:
-        return f"its principal point is {off:.0%} of the image off the centre"
+        return f"its principal point is off the centre by {off:.0%} of the image"
     lost = share_without_ray(camera)
     return f"{why_no_ray(camera.model_name)} at {lost:.1%} of the pixels" if lost else None
 

@@ -83,7 +83,7 @@ def no_ray(camera: Camera, share: float, of: str = "") -> StageError:
 def why_no_ray(model: str) -> str:
     """What may be the matter where a camera of this model has no ray: COLMAP's fisheyes end at 90° from the axis, and
     the ray directions that they give further out are of other pixels."""
-    return f"{'it looks beyond 90° from its axis or ' if is_fisheye(model) else ''}its distortion cannot be undone"
+    return f"{'it looks beyond 90° from its axis or ' if is_fisheye(model) else ''}its distortion has no inverse"
 
 
 def is_fisheye(model: str) -> bool:

@@ -85,7 +85,7 @@ def _simplify_degenerate(model: pycolmap.Reconstruction, database: Path, seed: i
     choice.notes.append(
         Note(
             "sfm.camera-replaced",
-            f"{photos}: the camera is degenerate ({next(iter(degenerate.values()))}): {SIMPLEST} instead",
+            f"{photos}: the camera is degenerate ({next(iter(degenerate.values()))}): {SIMPLEST} is used instead",
         )
     )
 
@@ -108,11 +108,11 @@ def _deregister_degenerate(model: pycolmap.Reconstruction, degenerate: dict[int,
 
 def _finished(model: pycolmap.Reconstruction, choice: CameraModels, left_out: dict[str, str]) -> AdjustedModel:
     notes, uncertainty = choice.notes, {}
-    untold = "how well the poses are known cannot be told"
+    untold = "the uncertainty of the poses is unknown"
     try:
         uncertainty = pose_uncertainty_px(model, choice.noise_px)
     except np.linalg.LinAlgError:
-        notes = [*notes, Note("sfm.poses-undetermined", f"{untold}: the points leave some of them free to move")]
+        notes = [*notes, Note("sfm.poses-undetermined", f"{untold}: the points do not fix all poses")]
     except MemoryError as error:
         notes = [*notes, Note("sfm.uncertainty-memory", f"{untold}: {str(error) or 'memory ran out'}")]
     by_name = {model.image(i).name: px for i, px in uncertainty.items()}

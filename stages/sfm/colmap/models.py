@@ -27,7 +27,7 @@ def read_model(sparse: Path) -> SparseModel:
             "sfm.damaged-model",
             f"cannot read the COLMAP model in {sparse}",
             str(error),
-            "Correct that or export the model again; or leave the cameras out, and they are found from the photos.",
+            "Correct it or export the model again; or leave out the cameras to find them from the photos.",
         ) from error
     camera_ids = sorted(files.cameras)
     images = sorted(files.images.values(), key=lambda image: image.name)

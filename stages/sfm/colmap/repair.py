@@ -102,11 +102,13 @@ def reasons(model: pycolmap.Reconstruction, checked: Checked) -> dict[str, str]:
         checked.ids, check.misplaced, check.unlinked, check.votes_for, check.votes_against, strict=True
     ):
         if misplaced:
-            matches = f"{against:,.0f} of its {agree + against:,.0f} verified matches with other photos"
-            together = f", as for {groups - 1} more" if groups > 1 else ""
-            found[model.image(image_id).name] = f"its pose is contradicted by {matches}{together}"
+            matches = (
+                f"{against:,.0f} of its {agree + against:,.0f} verified matches with other photos contradict its pose"
+            )
+            together = f", and so for {groups - 1} more" if groups > 1 else ""
+            found[model.image(image_id).name] = f"{matches}{together}"
         elif unlinked:
-            found[model.image(image_id).name] = "no verified match links its pose to the other photos"
+            found[model.image(image_id).name] = "no verified match links it to the other photos"
     return found
 
 
@@ -145,7 +147,7 @@ def drop_outside_main_segment(
     outside = outside_main_segment(_numbers(checked, sequence), checked.matches, checked.check, ORDER_OVERLAP)
     ids = [image_id for image_id, is_outside in zip(checked.ids, outside, strict=True) if is_outside]
     deregister(model, ids)
-    why = f"its pose is contradicted by {neighbours}: repeated structure"
+    why = f"{neighbours} contradict its pose: repeated structure"
     return {model.image(image_id).name: why for image_id in ids}
 
 

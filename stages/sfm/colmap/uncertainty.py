@@ -40,7 +40,7 @@ def pose_uncertainty_px(model: pycolmap.Reconstruction, noise: float) -> dict[in
         return {}
     needed, free = MATRICES * (6 * len(ids)) ** 2 * 8, available_bytes()
     if needed > free:
-        raise MemoryError(f"it would take {bytes_in_words(needed)} and {bytes_in_words(free)} are free")
+        raise MemoryError(f"computing it takes {bytes_in_words(needed)}, and only {bytes_in_words(free)} are free")
     to_pose, to_point = _jacobians(model, seen)
     covariance = _whitened_covariance(model, seen, ids, to_pose, to_point)
     sigma = _error_px(residuals(model, seen), noise, len(ids), len(np.unique(seen.point)))

@@ -75,8 +75,8 @@ def write_imported_model(
         raise StageError(
             "sfm.points-do-not-fit",
             f"the cameras of {cameras.name} do not fit its points",
-            f"{lost} of {len(errors)} points are seen where their cameras cannot see anything",
-            "Check the distortion of the cameras, or leave them out to have them found from the photos.",
+            f"{lost} of {len(errors)} points are observed at pixels that have no ray in their camera",
+            "Check the distortion of the cameras, or leave them out to find them from the photos.",
         )
     return known, errors
 
@@ -86,15 +86,15 @@ def _another_convention(
 ) -> StageError:
     """The error for poses that agree with their photos under another convention than they were read with."""
     direction, axes = found_convention(fit, read_as)
-    how = f"as {direction.replace('-', ' ')}, its cameras with {axes_in_words(axes)}"
-    how += ", in a left-handed world" * fit.mirrored + ", its quaternions as x, y, z, w" * fit.scalar_last
+    how = f"as {direction.replace('-', ' ')}, with camera axes {axes_in_words(axes)}"
+    how += ", in a left-handed world" * fit.mirrored + ", with quaternions as x, y, z, w" * fit.scalar_last
     of = listed([photos[i] for i in fit.of], MAX_NAMES)
     return StageError(
         "sfm.other-pose-convention",
         f"the poses of {len(fit.of)} of {len(photos)} photos in {name} contradict the others" if fit.of
         else f"the poses of {name} contradict their photos",
         f"{check['agreeing']} of {check['pairs']} verified pairs of photos agree with them; read {how}, "
-        f"{fit.agreeing} of {fit.pairs} {f'pairs of these photos do: {of}' if fit.of else 'do'}",
+        f"{fit.agreeing} of {fit.pairs} {f'pairs of these photos agree: {of}' if fit.of else 'agree'}",
         _how_to_convert(fit, direction, axes, read_as),
     )  # fmt: skip
 
@@ -105,26 +105,26 @@ def _how_to_convert(fit: Fit, direction: str, axes: Float[np.ndarray, "3 3"], re
     say_so = f"--sfm.pose-direction {direction} --sfm.camera-axes {known}"
     if fit.scalar_last:
         also = "" if known and (direction, known) == read_as else f", and add {say_so}" if known else ""
-        return f"Write the quaternions of images.txt as QW QX QY QZ{also}."
+        return f"Write the quaternions in images.txt as QW QX QY QZ{also}."
     if known and not fit.of:
-        return f"If that is how they are meant, add {say_so}."
+        return f"If the file means that, add {say_so}."
     columns = f"take its columns {columns_for(AXES[read_as.axes or 'opencv'], axes)} (- means negated)"
     of_which = f"the matrix of each of these {len(fit.of)}" if fit.of else "each matrix"
     steps = [f"invert {of_which}", columns] if direction != read_as.direction else [f"of {of_which} {columns}"]
     steps = [*steps, "negate its third row"] if fit.mirrored else steps
-    return f"To convert them, {', then '.join(steps)}; or leave the cameras out: pipeline run FOLDER"
+    return f"To convert them, {', then '.join(steps)}; or leave out the cameras: pipeline run FOLDER"
 
 
 def _check(
     model: SparseModel, photos: Sequence[Photo], ingest: Path, folder: Path, of_quaternions: bool, progress: Progress
 ) -> dict[str, Any] | None:
     """What verified matches of neighbouring photos say of imported poses; None, with a note, where they say nothing."""
-    progress.update("comparing the cameras with what neighbouring photos show")
+    progress.update("comparing the imported poses with matches of neighbouring photos")
     posed = {image.file for image in model.images}
     posed_photos = [photo for photo in photos if photo.image_name in posed]
     check = check_imported_poses(posed_photos, ingest / "images", folder, of_quaternions)
     if why := check.get("failed"):
-        progress.note("sfm.poses-unchecked", f"the imported poses could not be checked: {why}")
+        progress.note("sfm.poses-unchecked", f"the imported poses were not checked: {why}")
         return None
     return check
 
@@ -143,14 +143,14 @@ def _note_doubts(
         progress.note(
             "sfm.poses-contradict",
             f"the cameras of {source} contradict their photos: only {check['agreeing']} of {check['pairs']} verified "
-            "pairs of photos agree with them, and no other convention of poses helps. Check its focal lengths, and "
-            "that these are the photos it was made for; or leave it out, and the cameras are found from the photos",
+            "pairs of photos agree with them, and no other pose convention fits better. Check the focal lengths, and "
+            "that the cameras belong to these photos; or leave out the cameras to find them from the photos",
         )
     elif check["doubtful"]:
         names = dict(zip([image.file for image in model.images], _names(model, photos), strict=True))
         who = listed([names[file] for file in check["doubtful"]], MAX_NAMES)
         progress.note(
             "sfm.doubtful-poses",
-            f"{len(check['doubtful'])} of {len(model.images)} imported poses contradict what their photos show: {who}. "
-            f"They are used; correct or remove them in {source} if they are wrong",
+            f"{len(check['doubtful'])} of {len(model.images)} imported poses contradict the matches of their photos: "
+            f"{who}. They are used; correct or remove them in {source} if they are wrong",
         )

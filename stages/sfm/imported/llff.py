@@ -32,10 +32,10 @@ def read_llff(file: Path) -> list[LlffCamera]:
         with file.open("rb") as stream:
             rows = np.lib.format.read_array(stream)  # as np.load, but for pickles, which run code
     except (ValueError, EOFError, OverflowError, MemoryError) as error:
-        raise ValueError(f"it is no array that NumPy wrote ({error})") from error
+        raise ValueError(f"it is no NumPy array ({error})") from error
     if not (rows.ndim == 2 and rows.shape[1] == ROW and rows.dtype.kind in "fiu"):
         shape = " × ".join(map(str, rows.shape))
-        raise ValueError(f"it holds {shape}, not a row of {ROW} numbers for each photo")
+        raise ValueError(f"it holds {shape} instead of a row of {ROW} numbers for each photo")
     return [_camera(row, number) for number, row in enumerate(rows.astype(np.float64), 1)]
 
 
@@ -43,8 +43,8 @@ def _camera(row: Float[np.ndarray, "17"], number: int) -> LlffCamera:
     matrix = row[:15].reshape(3, 5)
     height, width, focal = matrix[:, 4].tolist()
     if not np.isfinite(matrix).all():
-        raise ValueError(f"row {number} has numbers that are not finite")
+        raise ValueError(f"row {number} holds NaN or infinity")
     if not all(1 <= side < 2**31 and side.is_integer() for side in (height, width)):
-        raise ValueError(f"row {number} gives a photo of {width:g} × {height:g} pixels")
+        raise ValueError(f"row {number} says that the photo has {width:g} × {height:g} pixels")
     camera = Camera("PINHOLE", int(width), int(height), (focal, focal, width / 2, height / 2))
     return LlffCamera(camera, np.concatenate([matrix[:, :3] @ LLFF_FROM_OPENCV, matrix[:, 3:4]], axis=1))

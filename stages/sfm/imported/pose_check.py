@@ -98,7 +98,7 @@ def check(photos: list[dict[str, Any]], images: str, folder: str, of_quaternions
     checked = check_model(model, database, 0) if verified >= MIN_PAIRS else None
     shutil.rmtree(scratch)
     if checked is None:
-        return {"failed": f"only {verified} pairs of neighbouring photos share enough features"}
+        return {"failed": f"only {verified} pairs of neighbouring photos have enough matches"}
     found = facts(model, checked)
     fit = best_fit(checked.matches, poses, of_quaternions) if 2 * found["agreeing"] < found["pairs"] else None
     if fit is None and found["agreeing"] < found["pairs"]:

@@ -137,12 +137,12 @@ def _from_transforms(
     unposed = [photo.name for photo in photos if photo.image_name not in known]
     kept_tests = sorted(set(found.test_files) - left_out.keys())
     if found.test_files and not kept_tests:
-        words = "all official test photos are among those left out, so others are held out"
+        words = "all official test photos are left out, so other photos become test photos"
         notes.append(Note("sfm.tests-left-out", words))
     return ImportedPoses(
         model=SparseModel.without_points(*distinct(kept)),
         left_out=left_out
-        | dict.fromkeys(found.unused, "the transforms file has it neither to train nor to test on")
+        | dict.fromkeys(found.unused, "it is in no split of the transforms file")
         | dict.fromkeys(found.poseless, "its frame has no pose"),
         test_files=kept_tests or None,
         notes=_notes(found.absent, unposed, posed, left_out) + notes,
@@ -209,18 +209,18 @@ def _on_frames(found: _MatchedFrames, repeated: Sequence[str]) -> list[Note]:
     """Notes on frames that are listed twice, have no pose, or say that their camera model is another."""
     notes = []
     if repeated:
-        notes.append(Note("sfm.repeated-frames", f"{len(repeated)} frames are listed twice, alike: {_few(repeated)}"))
+        notes.append(Note("sfm.repeated-frames", f"the file repeats {len(repeated)} frames: {_few(repeated)}"))
     approximate = [one for one in found.framed.values() if str(one.values.get("note", "")).startswith(APPROXIMATION)]
     if approximate:
-        words = f"the camera models of {len(approximate)} frames are approximations, as their notes in the file say"
+        words = f"the camera models of {len(approximate)} frames are approximations, according to the notes in the file"
         notes.append(Note("sfm.approximate-cameras", words))
     if found.poseless:
         count = f"{len(found.poseless)} of {len(found.poseless) + len(found.framed)} frames"
-        words = f"{count} have no pose (null, zeros or NaN), and their photos are left out"
+        words = f"{count} have no pose (null, zeros or NaN), so their photos are left out"
         notes.append(Note("sfm.frames-without-pose", f"{words}: {_few(sorted(found.poseless.values()))}"))
     if found.unused:
         names = _few(sorted(found.unused.values()))
-        words = f"{len(found.unused)} photos are neither to train nor to test on and are left out: {names}"
+        words = f"{len(found.unused)} photos are in no split of the file and are left out: {names}"
         notes.append(Note("sfm.in-no-split", words))
     return notes
 
@@ -252,7 +252,7 @@ def _two_frames(photo: str, source: str, first: str, second: str, differ: Sequen
     return StageError(
         "sfm.two-frames",
         f"two frames of {source} for the photo {photo} differ",
-        f"{which}, and differ in {_few(differ)}",
+        f"{which}, with different {_few(differ)}",
         "Remove one of them and run again.",
     )
 
@@ -269,7 +269,7 @@ def _split(content: Mapping[str, Any], source: str, notes: list[Note]) -> tuple[
             notes.append(
                 Note(
                     "sfm.tests-repeat-training",
-                    f"{key} of {source} repeats {repeated} photos to train on: they stay that",
+                    f"{key} of {source} repeats {repeated} training photos: they remain training photos",
                 )
             )
         if own := names - train:
@@ -282,19 +282,19 @@ def _listed(content: Mapping[str, Any], key: str, source: str, notes: list[Note]
     StageError where none has a frame."""
     names = content.get(key) or []
     if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
-        raise unusable("sfm.split-no-list", f"the {key} of {source}", "it is no list of names")
+        raise unusable("sfm.split-no-list", f"the {key} of {source}", "it is not a list of names")
     of_frames = {PurePosixPath(frame["file_path"]) for frame in content["frames"]}
     strange = [name[:MAX_LETTERS] for name in names if PurePosixPath(name) not in of_frames]
     if strange and len(strange) == len(names):
         raise unusable(
             "sfm.split-of-no-frame",
             f"the {key} of {source}",
-            f"none of them is the file_path of a frame: {_few(strange)}",
+            f"no frame has one of its names as file_path: {_few(strange)}",
         )
     if strange:
         notes.append(
             Note(
-                "sfm.split-photos-unknown", f"{len(strange)} photos in {key} of {source} have no frame: {_few(strange)}"
+                "sfm.split-photos-unknown", f"{len(strange)} names in {key} of {source} have no frame: {_few(strange)}"
             )
         )
     return set(map(PurePosixPath, names))
@@ -304,7 +304,7 @@ def _contradictions(files: Sequence[Mapping[str, Any]], framed: Mapping[str, _Fr
     """Notes on what files and frames say of a camera twice and not alike."""
     size = next((one.photo.width, one.photo.height) for one in framed.values())
     notes = [
-        Note("sfm.file-contradicts-itself", f"of all frames: {what}")
+        Note("sfm.file-contradicts-itself", f"all frames: {what}")
         for content in files
         for what in contradictions(content, *size)
     ]
@@ -315,7 +315,7 @@ def _contradictions(files: Sequence[Mapping[str, Any]], framed: Mapping[str, _Fr
     }
     if of_frames:
         name, what = next(iter(of_frames.items()))
-        more = f" ({len(of_frames) - 1} more frames likewise)" if len(of_frames) > 1 else ""
+        more = f" ({len(of_frames) - 1} more frames have the same fault)" if len(of_frames) > 1 else ""
         notes.append(Note("sfm.frame-contradicts-itself", f"frame {name!r}: {'; '.join(what)}{more}"))
     return notes
 
@@ -368,16 +368,15 @@ def _rigid(matrix: Any, where: str) -> tuple[Float[np.ndarray, "3 4"], _Rotation
     except ValueError as error:
         raise unusable("sfm.frame-pose", what, str(error)) from error
     if (distance := np.abs(pose[:, 3]).max()) > MAX_COORDINATE:
-        why = f"its position is {distance:.3g} units from the origin, and the most is {MAX_COORDINATE:g}"
+        why = f"its position is {distance:.3g} units from the origin; the limit is {MAX_COORDINATE:g}"
         raise unusable("sfm.pose-far-away", what, why)
     if not (largest := np.abs(pose[:, :3]).max()) <= MAX_ENTRY:
-        raise unusable("sfm.pose-large-entry", what, f"it is no rotation: {largest:.3g} is in it")
+        raise unusable("sfm.pose-large-entry", what, f"it is no rotation: it holds {largest:.3g}")
     if np.linalg.det(pose[:, :3]) < 0:
         raise StageError(
             "sfm.pose-mirrors",
             f"cannot use {what}",
-            "it mirrors (its determinant is negative), as poses of a left-handed world do, and a camera with one axis "
-            "the wrong way",
+            "it mirrors (its determinant is negative): the world is left-handed, or one camera axis is reversed",
             "Negate one row of every matrix if the world is left-handed (Unity, Unreal), else the column of that axis.",
         )
     rotation = _nearest_rotation(pose[:, :3])
@@ -404,7 +403,7 @@ def _rounded_or_scaled(rotations: Mapping[str, _Rotation]) -> list[Note]:
         notes.append(
             Note(
                 "sfm.rounded-rotations",
-                f"the rotations of {len(rounded)} frames are rounded, {off}: {_few(list(rounded))}",
+                f"the rotations of {len(rounded)} frames are rounded and {off}: {_few(list(rounded))}",
             )
         )
     if scaled := {name: r.scale for name, r in rotations.items() if abs(r.scale - 1) > SCALED_WITHIN}:
@@ -412,7 +411,7 @@ def _rounded_or_scaled(rotations: Mapping[str, _Rotation]) -> list[Note]:
         notes.append(
             Note(
                 "sfm.scaled-matrices",
-                f"the matrices of {len(scaled)} frames scale by {by}, which is left out: {_few(list(scaled))}",
+                f"the matrices of {len(scaled)} frames scale by {by}; the scale is ignored: {_few(list(scaled))}",
             )
         )
     return notes
@@ -430,7 +429,7 @@ def _from_llff(
     except (OSError, ValueError) as error:
         raise unusable("sfm.llff-unreadable", file.name, str(error)) from error
     if len(given) != len(rows):
-        why = f"it has {len(given)} rows, one for each photo, and there are {len(rows)} photos"
+        why = f"it has {len(given)} rows for {len(rows)} photos; it needs one row for each photo"
         raise unusable("sfm.llff-count", file.name, why)
     by_name = {photo.name: photo for photo in photos}
     of = [(by_name[name], given[int(row)]) for row, name in rows.items() if name in by_name]
@@ -481,17 +480,17 @@ def _from_colmap(folder: Path, photos: Sequence[Photo], convention: PoseConventi
         notes.append(
             Note(
                 "sfm.other-spellings",
-                f"{len(others)} photos have the cameras of files whose names are spelt otherwise: {_few(others)}",
+                f"{len(others)} photos take the cameras of images whose names are spelt differently: {_few(others)}",
             )
         )
     if not len(given.xyz):
+        notes.append(Note("sfm.no-points", "the model has no points: near and far are estimated from the camera poses"))
+    if behind:
         notes.append(
             Note(
-                "sfm.no-points", "the model has no points: near and far are taken from where its cameras stand and look"
+                "sfm.points-behind", f"{behind} observations are left out, because their points lie behind the cameras"
             )
         )
-    if behind:
-        notes.append(Note("sfm.points-behind", f"{behind} observations of points behind their cameras are left out"))
     return ImportedPoses(model, left_out, None, notes)
 
 
@@ -524,8 +523,8 @@ def _nothing_matches(source: str, names: Sequence[str], photos: Sequence[Photo])
     return StageError(
         "sfm.no-camera-matches",
         f"no camera in {source} belongs to a photo",
-        f"{its}, and the photos are {here}",
-        "Give the folder of the photos that these cameras belong to, under the names that they had then.",
+        f"{its}; the photos are {here}",
+        "Give the folder of the photos that these cameras belong to, with their original names.",
     )
 
 
@@ -536,8 +535,8 @@ def _notes(
     bent = [one.photo.name for one in posed if one.file in left_out]
     for names, code, what in (
         (absent, "sfm.no-photo", "cameras have no photo"),
-        (unposed, "sfm.no-camera", "photos have no camera and are left out"),
-        (bent, "sfm.no-rays", "photos have a camera without a ray for some of their pixels and are left out"),
+        (unposed, "sfm.no-camera", "photos are left out, because they have no camera"),
+        (bent, "sfm.no-rays", "photos are left out, because their cameras have no ray for some pixels"),
     ):
         if names:
             notes.append(Note(code, f"{len(names)} {what}: {_few(sorted(names))}"))

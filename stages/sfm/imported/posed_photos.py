@@ -14,7 +14,7 @@ from stages.sfm.colmap.cameras import native, no_ray, rescaled, share_without_ra
 from stages.sfm.imported.orientation import QUARTER_TURNS, is_of_stored_pixels, same_shape, turned_camera, turned_pose
 from stages.sfm.imported.transforms_intrinsics import why_unusable
 
-HINT = "Correct that and run again, or leave the cameras out, and they are found from the photos: pipeline run FOLDER"
+HINT = "Correct it and run again, or leave out the cameras to find them from the photos: pipeline run FOLDER"
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ def _turns(photo: Photo, camera: Camera, where: str, upright: bool) -> int:
         raise StageError(
             "sfm.mirrored-photo",
             f"cannot use the camera of {where}",
-            f"the EXIF orientation {photo.orientation} of {photo.name} mirrors the photo, which no camera pose can do",
-            "Leave the cameras out, or make them for photos that are saved upright, without an EXIF orientation.",
+            f"the EXIF orientation {photo.orientation} of {photo.name} mirrors the photo, and no camera pose mirrors",
+            "Leave out the cameras, or make them for photos that are saved upright, without an EXIF orientation.",
         )
     return QUARTER_TURNS[photo.orientation]
 
@@ -70,7 +70,7 @@ def _at_size_of(photo: Photo, camera: Camera, where: str) -> Camera:
         raise unusable(
             "sfm.photo-shape",
             f"the camera of {where}",
-            f"it is for {camera.width}×{camera.height} pixels, the photo has {photo.width}×{photo.height}",
+            f"it has {camera.width}×{camera.height} pixels, and the photo has {photo.width}×{photo.height}",
         )
     return rescaled(camera, *size)
 

@@ -92,12 +92,12 @@ def _of_block(name: str, block: Any) -> dict[str, Any]:
         fx, fy, cx, cy = values
         return {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
     if len(values) not in (9, 12, 16):
-        raise ValueError(f"its {name} has {len(values)} numbers, not the 3 × 3 of a camera matrix")
+        raise ValueError(f"its {name} has {len(values)} numbers instead of the 3 × 3 of a camera matrix")
     matrix = values.reshape(len(values) // (3 if len(values) == 9 else 4), -1)[:3, :3]
     matrix = matrix.T if matrix[2, :2].any() else matrix
     if matrix[2].tolist() != [0, 0, 1] or matrix[1, 0] or abs(matrix[0, 1]) > MAX_SKEW * abs(matrix[0, 0]):
         rows = "; ".join(" ".join(f"{value:.4g}" for value in row) for row in matrix)
-        raise ValueError(f"its {name} is no camera matrix of fx, 0, cx; 0, fy, cy; 0, 0, 1: {rows}")
+        raise ValueError(f"its {name} is no camera matrix (fx 0 cx; 0 fy cy; 0 0 1): {rows}")
     return {"fl_x": matrix[0, 0], "fl_y": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
 
 
@@ -114,15 +114,17 @@ def contradictions(values: Mapping[str, Any], width: int, height: int) -> list[s
         (taken, pixels), *others = focal.items() or [("", 0.0)]
         for name, other in others:
             if abs(other - pixels) > SAME_WITHIN * abs(pixels):
-                found.append(f"{taken} is {pixels:.5g} pixels and {name} says {other:.5g}: {taken} is taken")
+                found.append(f"{taken} is {pixels:.5g} pixels but {name} gives {other:.5g}; {taken} is used")
         if taken == (name := f"{axis}_fov") and (angle := float(values[name])) < math.pi:
-            found.append(f"{name} is {angle:.4g} and read as degrees: if it is radians, call it camera_angle_{axis}")
+            found.append(
+                f"{name} is {angle:.4g} and is read in degrees; a value in radians belongs in camera_angle_{axis}"
+            )
     terms = values.get("distortion_params")
     if isinstance(terms, list) and len(terms) == len(NERFSTUDIOS):
         other = [name for name, term in zip(NERFSTUDIOS, terms, strict=True) if values.get(name, term) != term]
-        found += [f"{', '.join(other)} and distortion_params differ: distortion_params is taken"] * bool(other)
+        found += [f"{', '.join(other)} and distortion_params differ; distortion_params is used"] * bool(other)
     if values.get("is_fisheye") and values.get("camera_model", FISHEYE) not in (*FISHEYES, "", None):
-        found.append(f"camera_model is {values['camera_model']} and is_fisheye is true: a fisheye is taken")
+        found.append(f"camera_model is {values['camera_model']} but is_fisheye is true; a fisheye is used")
     return found
 
 
@@ -143,7 +145,7 @@ def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: f
 
     w, h = number("w", width), number("h", height)
     if not all(1 <= side <= MAX_SIDE and side.is_integer() for side in (w, h)):
-        raise ValueError(f"its w and h are {w:g} and {h:g}")
+        raise ValueError(f"its w and h are {w:g} and {h:g}, which no image has")
     along = _focal_length(values, "x", w), _focal_length(values, "y", h)
     given = [one for one in along if one is not None] or [focal * max(w, h)] * (focal > 0)
     if not given:
@@ -164,12 +166,12 @@ def _why_no_focal_length(values: Mapping[str, Any]) -> str:
     if wide:
         key, angle = wide[0]
         most = (
-            "radians, between 0 and π: degrees are called x_fov" if key.startswith("camera") else "degrees, below 180"
+            "radians, between 0 and π (degrees belong in x_fov)" if key.startswith("camera") else "degrees, below 180"
         )
-        return f"its {key} is {repr(angle)[:MAX_LETTERS]} and should be in {most}"
+        return f"its {key} is {repr(angle)[:MAX_LETTERS]}; it must be in {most}"
     others = sorted(values.keys() - OF_INTRINSICS - NOT_OF_CAMERAS)
-    there = f"; what it has is {listed(others, MAX_KEYS)}" if others else ""
-    return f"no focal length in it: neither fl_x (pixels) nor camera_angle_x (radians) nor x_fov (degrees){there}"
+    there = f"; it has {listed(others, MAX_KEYS)}" if others else ""
+    return f"it has no focal length: no fl_x (pixels), camera_angle_x (radians) or x_fov (degrees){there}"
 
 
 def why_unusable(camera: Camera) -> str | None:
@@ -182,11 +184,11 @@ def why_unusable(camera: Camera) -> str | None:
     longer = max(camera.width, camera.height)
     if not all(FOCAL_RATIOS[0] <= value / longer <= FOCAL_RATIOS[1] for value in focal):
         pixels = " × ".join(f"{value:.5g}" for value in focal)
-        why = f"a focal length of {pixels} pixels is not one for a picture of {camera.width}×{camera.height}"
-        return f"{why}; it may be in widths of the picture or in millimetres" if 0 < max(focal) < MIN_FOCAL_PX else why
+        why = f"a focal length of {pixels} pixels is impossible for a photo of {camera.width}×{camera.height}"
+        return f"{why}; it may be in image widths or in millimetres" if 0 < max(focal) < MIN_FOCAL_PX else why
     if max(map(abs, centre), default=0.0) > MAX_CENTRE_OFFSET * longer:
         at = ", ".join(f"{value:.5g}" for value in centre)
-        return f"its principal point ({at}) is far outside of its {camera.width}×{camera.height} pixels"
+        return f"its principal point ({at}) is far outside its {camera.width}×{camera.height} pixels"
     return None
 
 
@@ -197,7 +199,7 @@ def _with_named_terms(values: Mapping[str, Any]) -> Mapping[str, Any]:
     terms = values["distortion_params"]
     if not (isinstance(terms, list) and len(terms) == len(NERFSTUDIOS)):
         raise ValueError(
-            f"its distortion_params are not six numbers, {', '.join(NERFSTUDIOS)} as nerfstudio orders them"
+            f"its distortion_params are not the six numbers {', '.join(NERFSTUDIOS)}, in nerfstudio's order"
         )
     return {**values, **dict(zip(NERFSTUDIOS, terms, strict=True))}
 
@@ -211,7 +213,7 @@ def _declared(values: Mapping[str, Any]) -> str:
         known = ", ".join((*PERSPECTIVES[1:], *FISHEYES))
         raise ValueError(f"its camera_model is {repr(declared)[:MAX_LETTERS]}, which is none of {known}")
     if other := next((key for key in OTHER_CAMERA_MODELS if values.get(key, False) is not False), None):
-        raise ValueError(f"it has {other}: camera models of that kind are not supported")
+        raise ValueError(f"it has {other}, whose camera model is not supported")
     return FISHEYE if values.get("is_fisheye") and declared not in FISHEYES else declared
 
 
@@ -219,13 +221,13 @@ def _distortion(k: list[float], p: list[float], s: list[float], declared: str) -
     """COLMAP's model for these terms and its parameters after fx, fy, cx, cy."""
     if declared in FISHEYES:
         if any(k[4:]):
-            raise ValueError("it has a k5 or k6, and is a fisheye")
+            raise ValueError("it is a fisheye with k5 or k6, which is not supported")
         return (PRISM, [k[0], k[1], *p, k[2], k[3], *s]) if any(p) or any(s) else (FISHEYE, k[:4])
     if any(s):
-        raise ValueError(f"it has sx1 or sy1, and its camera_model is not {PRISM}")
+        raise ValueError(f"it has sx1 or sy1, but its camera_model is not {PRISM}")
     if any(k[3:]) and declared != RATIONAL:
         # In such files k4 multiplies r⁸, which no model of COLMAP has; FULL_OPENCV's k4 is a denominator's r².
-        raise ValueError("it has a k4, and its camera_model is not FULL_OPENCV")
+        raise ValueError("it has k4, but its camera_model is not FULL_OPENCV")
     if any(k[2:]):
         return RATIONAL, [k[0], k[1], *p, *k[2:]]
     if any(k) or any(p):

@@ -120,11 +120,11 @@ def chosen(
         everything = expected_pairs("exhaustive", count, neighbours)
         progress.note(
             "sfm.pair-selection",
-            f"{count} photos have {everything:,} pairs: {WAYS[matcher].format(neighbours)}, about {pairs:,}",
+            f"matching about {pairs:,} of {everything:,} pairs of photos: {WAYS[matcher].format(neighbours)}",
         )
     if seconds_given is None or len(levels) == 1 or _max_seconds(count, pairs) <= MATCHING_FRACTION * seconds_given:
         return ChosenOptions(*levels[0], matcher)
-    progress.update("measuring what features and matches of a few photos take")
+    progress.update("timing features and matches of a few photos")
     level, full = levels[0], _measured(photos, images, levels[0], matcher).of(count, pairs)
     seconds = full
     for less in levels[1:]:
@@ -155,7 +155,7 @@ def _level_message(count: int, full: QualityLevel, level: QualityLevel, seconds_
     said = f"features and matches of {count} photos take about {rough_duration(seconds_full)} with {_describe(full)}"
     if level == full:
         return said
-    return f"{said}, about {rough_duration(seconds)} with {_describe(level)}: these are used"
+    return f"{said}; {_describe(level)} are used instead, which takes about {rough_duration(seconds)}"
 
 
 def _describe(level: QualityLevel) -> str:
@@ -174,7 +174,7 @@ def _measured(photos: Sequence[Photo], images: Path, level: QualityLevel, matche
         lines = answer.stderr.decode("utf-8", "replace").strip().splitlines()
         why = lines[-1] if lines else f"COLMAP ended with {answer.returncode}"
         every = f"--sfm.matcher exhaustive --sfm.max-image-size {level.max_image_size}"
-        hint = f"Say how, and nothing is measured: {every} --sfm.max-features {level.max_features}."
+        hint = f"Choose the options yourself: {every} --sfm.max-features {level.max_features}."
         raise StageError("sfm.not-measured", "could not measure how long features and matches take", why, hint)
     return Cost(**json.loads(answer.stdout))
 

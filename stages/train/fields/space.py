@@ -21,17 +21,20 @@ MAX_WIDTH = 2.0
 def chosen_space(decisions: "Decisions", scene: "Scene") -> tuple["Space", str]:
     """The space that a field is to have, and the reason in words."""
     if "background" not in decisions.on:
-        return "bounded", "bounded: nothing is seen beyond the region of interest"
+        return "bounded", "bounded: the photos show nothing beyond the region of interest"
     if scene.capture_type != "forward-facing":
-        return "contracted", "contracted: the background is unbounded, and the photos do not face one way"
+        return "contracted", "contracted: the background is unbounded, and the capture is not forward-facing"
     pyramid = enclosing_pyramid(scene)
     if pyramid is None:
-        return "contracted", "contracted: the photos face one way, but some look aside too far for a pyramid"
+        return (
+            "contracted",
+            "contracted: the capture is forward-facing, but some photos look too far aside for one frustum",
+        )
     width = width_in_photos(pyramid, scene)
-    spread = f"a pyramid {width:.1f} times as wide as a photo holds all they see"
+    spread = f"one frustum {width:.1f} times as wide as a photo's holds the scene"
     if width > MAX_WIDTH:
-        return "contracted", f"contracted: the photos face one way, but only {spread}"
-    return "ndc", f"normalised device coordinates: the photos face one way, and {spread}"
+        return "contracted", f"contracted: the capture is forward-facing, but only {spread}"
+    return "ndc", f"normalised device coordinates: the capture is forward-facing, and {spread}"
 
 
 def space_map_of(config: Config, scene: "Scene") -> SpaceMap:
@@ -39,7 +42,7 @@ def space_map_of(config: Config, scene: "Scene") -> SpaceMap:
     if config.space != "ndc":
         return map_without_scene(config)
     if (pyramid := enclosing_pyramid(scene)) is None:
-        why = f"some photos look more than {MAX_ANGLE_DEG:g} degrees aside from where they look on average"
+        why = f"some photos look more than {MAX_ANGLE_DEG:g} degrees away from the mean viewing direction"
         hint = "Leave out --train.space ndc."
         raise StageError("train.no-pyramid", "cannot train in normalised device coordinates", why, hint)
     return pyramid

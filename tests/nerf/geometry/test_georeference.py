@@ -59,16 +59,13 @@ def test_a_few_wrong_places_do_no_harm() -> None:
 @pytest.mark.parametrize(
     ("enu", "why"),
     [
-        (walked()[:3], "3 registered photos have a GPS position, 4 are needed"),
-        (walked(radius_m=3) * [1, 1, 0], "their positions lie within 3 m, and GPS errs by up to 10 m"),
-        (
-            np.linspace(0, 90, 7)[:, None] * [1.0, 0, 0],
-            "they were taken along one line, which leaves open how the scene is turned about it",
-        ),
+        (walked()[:3], "3 registered photos"),
+        (walked(radius_m=3) * [1, 1, 0], "within 3 m, and GPS errs by up to 10 m"),
+        (np.linspace(0, 90, 7)[:, None] * [1.0, 0, 0], "along one line"),
     ],
 )
 def test_it_says_why_not(enu: np.ndarray, why: str) -> None:
-    assert georeference(SFM_FROM_ENU.points(enu), places(enu)) == why
+    assert why in str(georeference(SFM_FROM_ENU.points(enu), places(enu)))
 
 
 def test_without_all_heights_none_counts() -> None:
@@ -91,4 +88,4 @@ def test_gps_unrelated_to_the_photos_is_refused() -> None:
     told = np.random.default_rng(1).normal(0, 60, (12, 3))
     why = georeference(SFM_FROM_ENU.points(walked()), places(told))
     assert isinstance(why, str)
-    assert re.fullmatch(r"their GPS positions, \d+ m apart, are \d+ m off the reconstruction", why)
+    assert re.fullmatch(r"the GPS positions span \d+ m and are \d+ m off the reconstruction", why)

@@ -95,7 +95,7 @@ def test_an_interrupted_more_is_taken_up_by_the_same_words(trained, monkeypatch:
     ("words", "code", "message"),
     [
         (["--more", "10"], 2, "'10' is not a duration; write it like 90s, 10m or 1h30m"),
-        (["--more", "0steps"], 2, "--more 0steps is no training at all"),
+        (["--more", "0steps"], 2, "--more needs at least one step"),
         (["--more", "5steps", "--train.steps", "99"], 2, "--more and --train.steps are two budgets; give one"),
         (["--more", "5steps", "--train.preset", "high"], 2, "--more and --train.preset are two budgets; give one"),
         (["--more", "5steps", "--train.learning-rate", "0.5"], 14, "learning_rate is 0.5 now and was 0.02"),

@@ -169,7 +169,7 @@ def test_nothing_is_written_among_the_photos(
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.rglob("*"))
     assert run_command(["run", photos, "-o", workspace]) == 2
-    assert f"pipeline: -o {workspace}: that is a folder of photos; leave -o out" in capsys.readouterr().err
+    assert f"pipeline: -o {workspace}: that is a folder of photos; leave out -o" in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -204,7 +204,7 @@ def test_unnamed_workspaces_are_not_shared_by_photo_sets(
     assert run("scan2/photos") == 2
     said = capsys.readouterr().err
     assert f"photos.nerf was made from {tmp_path}/scan1/photos, not from {tmp_path}/scan2/photos; " in said
-    assert "-o another.nerf keeps them apart, -o photos.nerf goes on in this one" in said
+    assert "-o another.nerf" in said and "-o photos.nerf" in said
     assert (tmp_path / "photos.nerf/run.json").read_bytes() == before
     assert [run("scan2/photos", "-o", "photos.nerf"), run("scan2/photos")] == [0, 0]
     (tmp_path / "scan2").rename(tmp_path / "moved")

@@ -74,12 +74,12 @@ runpy.run_module("pipeline", run_name="__main__")
 @pytest.mark.parametrize(
     "words, way",
     [
-        ("run photos --from train", "`pipeline resume WORKSPACE` goes on"),
-        ("resume w", "`pipeline resume WORKSPACE` goes on"),
-        ("tradeoff w --budget 30m", "the same command goes on"),
-        ("demo", "the same command goes on"),
-        ("train w --force", "the same command begins anew"),
-        ("train w --replan", "the same command without --replan goes on"),
+        ("run photos --from train", "`pipeline resume WORKSPACE` continues"),
+        ("resume w", "`pipeline resume WORKSPACE` continues"),
+        ("tradeoff w --budget 30m", "the same command continues"),
+        ("demo", "the same command continues"),
+        ("train w --force", "the same command starts over"),
+        ("train w --replan", "the same command without --replan continues"),
     ],
 )
 def test_what_was_stopped_is_told_how_to_go_on(

@@ -145,7 +145,7 @@ def test_a_result_is_no_photo_set_of_its_own_workspace(workspace: Path, photos: 
         held.link_outputs(workspace / "ingest" / KEY, ("images",))
     for place in ("output/images", f"ingest/{KEY}/images"):
         assert run_command(["run", str(workspace / place), "-o", str(workspace)]) == 2
-        assert "is a result of that workspace" in capsys.readouterr().err
+        assert "is a result in that workspace" in capsys.readouterr().err
     assert (workspace / "output/images/0.png").is_file()
     shutil.copytree(photos, workspace / "mine")
     assert not is_result(workspace / "mine", workspace) and not is_result(photos, workspace)

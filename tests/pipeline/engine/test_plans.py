@@ -76,8 +76,8 @@ def test_status_explains_stale_stages_without_a_plan(
     monkeypatch.setattr("pipeline.engine.status.STAGES", fake_stages.STAGES)
     bring()
     for number, sfm, why in (
-        (1, {"fail": True}, "what its options leave open is chosen again"),
-        (50, {}, "ingest gives"),
+        (1, {"fail": True}, "its automatic options"),
+        (50, {}, "ingest has"),
     ):
         given = {"ingest": {"photos": tmp_path / "photos", "number": number}, "sfm": sfm}
         workspace, settings = Workspace(tmp_path / "w.nerf"), FakeSettings.model_validate(given)

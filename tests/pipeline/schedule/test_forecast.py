@@ -234,15 +234,13 @@ def test_a_budget_tells_its_end_or_its_lack(said_of: SaidOf) -> None:
     (words,) = said_of(600.0)
     assert words.startswith("budget 10 min, done at about ") and words[-3] == ":"
     (words,) = said_of(30.0)
-    assert words.startswith("budget 30 s, too short for these photos: about ")
-    assert words.endswith(" is the least that would do; all is made as small as can be")
+    assert words.startswith("budget 30 s, too short for these photos: ") and " at least about " in words
 
 
 def test_earlier_attempts_are_told_apart_from_small_budgets(said_of: SaidOf) -> None:
     (words,) = said_of(300.0, before=240.0)
-    assert words.startswith("budget 5 min, 1 min of it left by what was spent before; about ")
-    assert words.endswith(" is needed: give a larger --budget, or all is made as small as can be")
-    assert " 0 s of it left" in said_of(300.0, before=400.0)[0]
+    assert words.startswith("budget 5 min, of which 1 min are left; ") and "give a larger --budget" in words
+    assert "of which 0 s are left" in said_of(300.0, before=400.0)[0]
 
 
 def test_no_end_is_given_that_only_a_training_would_need(said_of: SaidOf) -> None:
@@ -281,4 +279,6 @@ def test_small_sets_are_expected_to_take_as_long_as_measured() -> None:
 def test_a_budget_too_short_for_reading_is_said_to_be(said_of: SaidOf) -> None:
     times: dict[str, float | None] = {"train": None, "report": 2.0}
     assert "done at about" in forecast.budget_message(STAGES, Left(60.0, 60.0), times, 1.0)
-    assert "too short for these photos: about 1 min" in forecast.budget_message(STAGES, Left(60.0, 60.0), times, 40.0)
+    assert "too short for these photos: it takes at least about 1 min" in forecast.budget_message(
+        STAGES, Left(60.0, 60.0), times, 40.0
+    )

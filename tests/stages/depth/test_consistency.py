@@ -1,7 +1,16 @@
 import numpy as np
 import pytest
 
-from stages.depth.consistency import MAX_SIGMA, SIGMA_FACTOR, Candidate, agreed
+from stages.depth.consistency import (
+    MAX_SIGMA,
+    MIN_PATCH_PIXELS,
+    SIGMA_FACTOR,
+    Candidate,
+    DepthMap,
+    SparseDepths,
+    agreed,
+    plausible,
+)
 from stages.depth.files import read_depth_map, write_depth_map
 from tests.refusals import refused
 
@@ -53,6 +62,46 @@ def test_the_order_of_neighbours_does_not_matter() -> None:
     assert 0.5 < one.coverage <= 1
     assert np.array_equal(one.views, other.views)
     assert np.mean(np.isclose(one.distance, other.distance, rtol=1e-5)) > 0.99
+
+
+def two_patches(sparse: list[tuple[int, int, float]]) -> list[bool]:
+    """Whether ``plausible`` keeps the left patch, at distance 2, and the right one, at 3, with a slope; ``sparse`` are
+    row, column, distance."""
+    distance = np.zeros((8, 16), np.float32)
+    distance[:, :7], distance[:, 7:] = 2, 3 * 1.005 ** np.arange(9)
+    known = distance > 0
+    depth = DepthMap(distance, np.where(known, 0.001, 0).astype(np.float32), known.astype(np.uint8))
+    row, column, true = (np.array(column) for column in zip(*sparse, strict=True))
+    kept = plausible(depth, SparseDepths(row, column, true))
+    assert {each.dtype for each in kept} == {np.dtype(np.float32), np.dtype(np.uint8)}
+    assert np.array_equal(kept.distance[kept.distance > 0], distance[kept.distance > 0])
+    assert all(np.array_equal(each > 0, kept.distance > 0) for each in kept)
+    shares = [float((kept.distance[:, part] > 0).mean()) for part in (slice(0, 7), slice(7, 16))]
+    assert set(shares) <= {0.0, 1.0}, "a patch stays or goes as a whole"
+    return [share > 0 for share in shares]
+
+
+@pytest.mark.parametrize(
+    ("sparse", "left", "right"),
+    [
+        ([(0, 0, 2.0), (0, 7, 3.0)], True, True),
+        ([(0, 0, 2.1), (0, 7, 3.0)], False, True),
+        ([(0, 0, 2.1), (3, 3, 2.0), (0, 8, 3.5)], True, False),
+        ([(0, 0, 2.03)], True, True),
+        ([(0, 15, 3.0)], True, False),
+    ],
+)
+def test_sparse_points_decide_over_patches(sparse: list[tuple[int, int, float]], left: bool, right: bool) -> None:
+    assert two_patches(sparse) == [left, right]
+
+
+@pytest.mark.parametrize("pixels", [MIN_PATCH_PIXELS - 1, MIN_PATCH_PIXELS])
+def test_patches_of_few_pixels_are_chance(pixels: int) -> None:
+    distance = np.zeros((10, 40), np.float32)
+    distance[4, :pixels] = 2
+    nowhere = SparseDepths(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+    kept = plausible(DepthMap(distance, distance, distance.astype(np.uint8)), nowhere)
+    assert (kept.distance > 0).sum() == (pixels if pixels >= MIN_PATCH_PIXELS else 0)
 
 
 def test_a_file_is_read_back_and_equal_every_time(tmp_path) -> None:

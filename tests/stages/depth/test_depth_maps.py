@@ -9,7 +9,7 @@ from stages.depth import Config, run
 from stages.depth.consistency import DepthMap
 from stages.depth.files import depth_map_file, read_depth_map
 from tests.conftest import SilentProgress
-from tests.stages.depth.walls import FISHEYE, WallScene, cameras_before, wall
+from tests.stages.depth.walls import FISHEYE, Wall, WallScene, cameras_before, wall
 
 BOX = ((0.1, -0.3, 0), (0.35, 0.3), 10.0, "strong", 2)
 
@@ -58,6 +58,49 @@ def test_textured_walls_are_where_they_are(name: str, tmp_path: Path) -> None:
     assert np.abs(np.median(error)) < 0.0005, "no bias"
     assert np.mean(np.abs(error) > 0.03) < 0.01
     assert 0.3 < np.median(np.abs(over_sigma)) < 1.2, "the standard deviation is one (0.67 for a normal law)"
+
+
+def glass(reflects: float, y: float, half: tuple[float, float], turn_deg: float = 0.0) -> Wall:
+    return wall((0, y, 0), half, turn_deg, "none")._replace(reflects=reflects)
+
+
+BEHIND_THE_CAMERAS = wall((0, -5.0, 0), (6, 4), 0.0, "strong", 5)
+
+
+def wrong(scene: WallScene, folder: Path, by: float = 0.03) -> tuple[float, float]:
+    """Shares of the walls' pixels that have a depth, and that have a wrong one."""
+    covered, error, _ = errors(scene, depth_maps(scene, folder))
+    return covered, covered * float(np.mean(np.abs(error) > by))
+
+
+def test_a_repeated_pattern_stands_on_its_wall(tmp_path: Path) -> None:
+    """Cameras at even distances, and a near thing, so that a wall a period in front of the true one is looked for."""
+    near = wall((0, -1, 0), (0.25, 0.2), 10, seed=2)
+    covered, bad = wrong(WallScene([back("repeated"), near], cameras_before(rows=1, columns=5)), tmp_path)
+    assert 0.5 < covered < 0.7
+    assert 0 < bad < 0.002, "0.05 where patches are not looked at"
+
+
+@pytest.mark.parametrize(("reflects", "least_covered", "most_wrong"), [(0.2, 0.75, 0.03), (0.5, 0.0, 0.02)])
+def test_a_window_pane_leaves_little_wrong(
+    reflects: float, least_covered: float, most_wrong: float, tmp_path: Path
+) -> None:
+    pane = glass(reflects, -0.5, (2, 1.5), 10)
+    covered, bad = wrong(WallScene([back(), BEHIND_THE_CAMERAS, pane], cameras_before()), tmp_path)
+    assert least_covered < covered < 0.9
+    assert 0 < bad < most_wrong
+
+
+def test_a_mirror_shows_nothing_in_front_of_it(tmp_path: Path) -> None:
+    scene = WallScene([back(), BEHIND_THE_CAMERAS, glass(1.0, 0.99, (0.5, 0.4))], cameras_before())
+    maps = depth_maps(scene, tmp_path)
+    solid = WallScene([back()], scene.poses)
+    inside = [scene.distances(view, 240, 180) > 5 for view in range(len(maps))]
+    known = [(m.distance > 0) & at for m, at in zip(maps, inside, strict=True)]
+    nearer = [(m.distance < 0.97 * solid.distances(view, 240, 180)) & known[view] for view, m in enumerate(maps)]
+    assert 0.05 < np.mean(inside) < 0.2
+    assert np.mean(known) < 0.1 * np.mean(inside)
+    assert np.mean(nearer) < 0.01 * np.mean(inside)
 
 
 def test_a_bare_wall_has_no_depth(tmp_path: Path) -> None:

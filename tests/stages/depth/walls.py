@@ -28,12 +28,14 @@ POINTS = 400  # on each wall
 
 
 class Wall(NamedTuple):
-    """The points centre + u · across + v · down, u and v in [-1, 1], and the picture on them, grey in [0, 1]."""
+    """The points centre + u · across + v · down, u and v in [-1, 1], and the picture on them, grey in [0, 1]. Of a
+    mirror (1) or a window pane (less) ``reflects`` says how much light it throws back; the rest comes from behind."""
 
     centre: np.ndarray
     across: np.ndarray
     down: np.ndarray
     picture: np.ndarray
+    reflects: float = 0.0
 
 
 rays_of = cache(camera_rays)
@@ -64,6 +66,17 @@ def picture(texture: str, size: Sequence[int], seed: int) -> np.ndarray:
     return np.clip(0.5 + contrast * noise / noise.std(), 0, 1).astype(np.float32)
 
 
+def _meet(
+    one: Wall, origins: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """How far along rays a wall's plane is, whether they meet the wall there, and where on it."""
+    normal = np.cross(one.across, one.down)
+    t = ((one.centre - origins) @ normal) / (directions @ normal)
+    at = origins + t[..., None] * directions - one.centre
+    u, v = (at @ axis / (axis @ axis) for axis in (one.across, one.down))
+    return t, (t > 0) & (np.abs(u) <= 1) & (np.abs(v) <= 1), (u, v)
+
+
 @dataclass(frozen=True)
 class WallScene:
     """Walls, and cameras that look at them. ``gains`` multiply the photos' values; all photos have the ``mask``."""
@@ -77,15 +90,28 @@ class WallScene:
     seed: int = 0
 
     def trace(self, view: int, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(grey in [0, 1], distance) along rays (h, w, 3) of a camera; grey 0.5 and infinity where there is no wall."""
+        """(grey in [0, 1], distance) along rays (h, w, 3) of a camera; grey 0.5 and infinity where there is no wall.
+        In a mirror the distance is that of what is seen in it, along the whole way of the light; through a window pane
+        that of what is behind it."""
         origin, directions = self.poses[view][:, 3], rays.astype(float) @ self.poses[view][:, :3].T
-        grey, distance = np.full(rays.shape[:2], 0.5), np.full(rays.shape[:2], np.inf)
-        for one in self.walls:
-            normal = np.cross(one.across, one.down)
-            t = ((one.centre - origin) @ normal) / (directions @ normal)
-            at = origin + t[..., None] * directions - one.centre
-            u, v = (at @ axis / (axis @ axis) for axis in (one.across, one.down))
-            hit = (t > 0) & (t < distance) & (np.abs(u) <= 1) & (np.abs(v) <= 1)
+        grey, distance = self._solid(np.broadcast_to(origin, directions.shape), directions)
+        for glass in (one for one in self.walls if one.reflects):
+            t, hit, _ = _meet(glass, origin, directions)
+            hit &= t < distance
+            normal = np.cross(glass.across, glass.down)
+            normal = normal / np.linalg.norm(normal)
+            mirrored = directions - 2 * (directions @ normal)[..., None] * normal
+            seen, beyond = self._solid(origin + t[..., None] * directions + 1e-6 * mirrored, mirrored)
+            grey = np.where(hit, grey + glass.reflects * (seen - grey), grey)
+            distance = np.where(hit & (glass.reflects == 1), t + beyond, distance)
+        return grey, distance
+
+    def _solid(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As :meth:`trace`, without glass."""
+        grey, distance = np.full(directions.shape[:2], 0.5), np.full(directions.shape[:2], np.inf)
+        for one in (one for one in self.walls if not one.reflects):
+            t, hit, (u, v) = _meet(one, origins, directions)
+            hit &= t < distance
             rows, columns = one.picture.shape
             x, y = ((w.astype(np.float32) + 1) / 2 * n - 0.5 for w, n in ((u, columns), (v, rows)))
             colour = cv2.remap(one.picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -106,11 +132,13 @@ class WallScene:
         return self.trace(view, rays_of(self.camera, width, height))[1]
 
     def tracks(self) -> dict[str, np.ndarray]:
-        """points.safetensors: points of all walls, seen wherever they are in a photo and nothing hides them."""
+        """points.safetensors: points of all walls but mirrors and panes, seen wherever they are in a photo and nothing
+        hides them."""
         random = np.random.default_rng(self.seed)
-        spots = random.uniform(-1, 1, (len(self.walls), POINTS, 2))
+        walls = [one for one in self.walls if not one.reflects]
+        spots = random.uniform(-1, 1, (len(walls), POINTS, 2))
         xyz = np.concatenate(
-            [w.centre + spots[i, :, :1] * w.across + spots[i, :, 1:] * w.down for i, w in enumerate(self.walls)]
+            [w.centre + spots[i, :, :1] * w.across + spots[i, :, 1:] * w.down for i, w in enumerate(walls)]
         )
         seen = []
         for view, pose in enumerate(self.poses):

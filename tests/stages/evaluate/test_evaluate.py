@@ -129,7 +129,7 @@ def test_a_perfect_field_is_sharp_and_beats_both_trivial_predictions(make: Make,
     assert 0.99 < metrics["ssim"] <= 1
     assert 5 < metrics["psnr_mean_image"] < 25 and 5 < metrics["psnr_nearest_view"] < 25
     assert metrics["verdict"].startswith("Sharp and trustworthy: 5")
-    assert line.endswith("· 4 photos at 32 × 24") and "nearest photo" in line
+    assert line.endswith("· 4 photos at 32 × 24") and "nearest training view" in line
     assert progress.updates[-1] == ("test photo 4 of 4", 1.0)
 
 
@@ -175,7 +175,7 @@ def test_photos_are_scored_at_their_own_size_whatever_was_trained(make: Make, tm
     inputs = make(NoisyField(0.05), downscale=2)
     metrics, line = _run(inputs, tmp_path / "out", progress)
     assert line.endswith("· 4 photos at 32 × 24 (trained at 16 × 12)")
-    assert " dB on 4 unseen photos at 32 × 24 (trained at 16 × 12), " in metrics["verdict"]
+    assert " dB on 4 test photos at 32 × 24 (trained at 16 × 12), " in metrics["verdict"]
     assert (metrics["photo_size"], metrics["scored_size"], metrics["trained_size"]) == ([32, 24], [32, 24], [16, 12])
     for image in metrics["images"]:
         render, truth = (
@@ -211,7 +211,7 @@ def test_short_time_means_tiles_of_every_photo(make: Make, tmp_path: Path, progr
     whole, _ = _run(inputs, tmp_path / "whole", progress, fraction=1)
     metrics, line = _run(inputs, tmp_path / "tiles", progress, fraction=0.25)
     assert (metrics["fraction"], metrics["photos_scored"], metrics["photos_test"]) == (0.25, 4, 4)
-    assert " dB on 25% of each of 4 unseen photos at 320 × 240 (trained at 160 × 120), " in metrics["verdict"]
+    assert " dB on 25% of each of 4 test photos at 320 × 240 (trained at 160 × 120), " in metrics["verdict"]
     assert line.endswith(" · 25% of each of 4 photos at 320 × 240 (trained at 160 × 120)")
     for image, of_all in zip(metrics["images"], whole["images"], strict=True):
         assert image["name"] == of_all["name"]
@@ -310,7 +310,7 @@ def test_a_test_photos_exposure_is_no_fault(stops: float, make: Make, tmp_path: 
     assert metrics["psnr_exposure_fitted"] == pytest.approx(noise_alone, abs=0.1)
     assert metrics["psnr"] < noise_alone - 6 and metrics["psnr_right_half"] < noise_alone - 6
     right, fitted = metrics["psnr_right_half"], metrics["psnr_exposure_fitted"]
-    words = f"right halves {right:.1f} dB, {fitted:.1f} dB with the exposure fitted on the left half · nearest photo"
+    words = f"right halves {right:.1f} dB, {fitted:.1f} dB with the exposure fitted on the left half · nearest "
     assert words in line and line.startswith(f"{metrics['psnr']:.1f} ± ")
     assert f"{metrics['psnr']:.1f} dB" in metrics["verdict"], "the verdict keeps the raw score"
 

@@ -114,4 +114,4 @@ def test_poses_are_fitted_where_training_refined_them_or_as_asked(asked: Any, re
 )
 def test_the_line_names_what_was_fitted(scores: tuple[float | None, ...], words: str) -> None:
     fitted = dict(zip(RIGHT_HALVES, scores, strict=True))
-    assert f"20.5 dB, SSIM 0.60{words} · nearest photo" in line_of(METRICS | fitted)
+    assert f"20.5 dB, SSIM 0.60{words} · nearest training view" in line_of(METRICS | fitted)

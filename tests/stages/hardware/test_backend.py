@@ -24,8 +24,7 @@ from tests.stages.photo_scene import photographed
 ROOT = Path(__file__).parents[3]
 TINY: dict[str, Any] = {"num_levels": 2, "log2_hashmap_size": 10, "max_res": 32, "target_samples": 1024}
 OLD_DRIVER = "Warp 1.19.0 finds no CUDA driver that is new enough for it"
-NOTE = "the hash-grid field is computed by torch alone, several times slower: "
-AS_TRAINED = "the hash-grid field is computed by torch alone, as it was trained: several times slower than by Warp"
+NOTE, AS_TRAINED = "hardware.torch-alone", "hardware.trained-without-warp"
 
 
 @pytest.fixture
@@ -48,13 +47,13 @@ def test_warp_is_chosen_where_it_runs_and_nothing_is_said(progress) -> None:
 
 def test_otherwise_torch_is_chosen_and_the_reason_said(useless: None, progress) -> None:
     assert chosen_backend("cuda", progress) == "torch"
-    assert progress.said("hardware.torch-alone") == [NOTE + OLD_DRIVER]
+    assert progress.codes == [NOTE] and progress.names(NOTE, OLD_DRIVER)
     assert chosen_backend("cuda") == "torch"
 
 
 def test_a_warp_that_does_not_load_is_no_failure(missing: None, progress) -> None:
     assert chosen_backend("cpu", progress) == "torch"
-    assert progress.notes[0].startswith(NOTE + "warp-lang does not load here: import of nerf.kernels.warp halted")
+    assert progress.names(NOTE, "warp-lang", "import of nerf.kernels.warp halted")
 
 
 def test_where_kernels_cannot_be_kept_the_way_out_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,8 +61,8 @@ def test_where_kernels_cannot_be_kept_the_way_out_is_named(tmp_path: Path, monke
     environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / "file")}
     code = "from stages.hardware.backend import chosen_backend as c, why_not_warp as w; print(c('cpu'), w('cpu'))"
     answer = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert answer.stdout.startswith("torch compiled kernels cannot be kept here ([Errno "), answer.stderr
-    assert answer.stdout.endswith("; the variable WARP_CACHE_PATH can name another folder\n")
+    assert answer.stdout.startswith("torch ") and "([Errno " in answer.stdout, answer.stderr
+    assert "WARP_CACHE_PATH" in answer.stdout
 
     def full(device: str) -> None:
         raise OSError(errno.ENOSPC, "No space left on device", "/home/.cache")
@@ -89,16 +88,13 @@ def test_a_backend_is_loaded_by_name(progress) -> None:
     assert progress.updates == [("compiling kernels, once on each machine", None)]
 
 
-@pytest.mark.parametrize(("trouble", "why"), [("useless", OLD_DRIVER), ("missing", "warp-lang does not load here: ")])
+@pytest.mark.parametrize(("trouble", "why"), [("useless", OLD_DRIVER), ("missing", "warp-lang")])
 def test_warp_asked_for_by_name_is_not_replaced_silently(
     trouble: str, why: str, request: pytest.FixtureRequest
 ) -> None:
     request.getfixturevalue(trouble)
-    with pytest.raises(StageError) as refused:
+    with refused("hardware.no-warp", why, "--train.grid.backend torch"):
         load_backend("warp", "cuda")
-    assert refused.value.what == "cannot use the Warp kernels"
-    assert refused.value.why.startswith(why)
-    assert refused.value.hint == "Use --train.grid.backend torch."
 
 
 def test_loading_warp_says_nothing_and_leaves_stderr_open() -> None:
@@ -120,7 +116,7 @@ def test_planning_chooses_and_keeps_a_backend(tmp_path: Path, progress, monkeypa
     assert train.plan(sized, inputs, progress).grid.backend == "warp"
     monkeypatch.setattr(warp, "unavailable_reason", lambda device: OLD_DRIVER)
     assert train.plan(sized, inputs, progress).grid.backend == "torch"
-    assert progress.said("hardware.torch-alone") == [NOTE + OLD_DRIVER]
+    assert progress.codes.count(NOTE) == 1 and progress.names(NOTE, OLD_DRIVER)
     with refused("hardware.no-warp", "--train.grid.backend torch"):
         train.plan(tiny("warp", steps=10), inputs, progress)
 
@@ -155,7 +151,7 @@ def test_what_torch_trained_stays_with_torch_in_every_stage(stage: ModuleType, t
     for name in ("train", "later"):
         (tmp_path / name).mkdir()
     run_stage(train, tiny("torch", steps=2), inputs, tmp_path / "train", progress)
-    assert AS_TRAINED not in progress.notes
+    assert AS_TRAINED not in progress.codes
     with contextlib.suppress(StageError):  # two steps may leave no surface
         run_stage(stage, LATER[stage], inputs | {"train": tmp_path / "train"}, tmp_path / "later", progress)
-    assert progress.notes.count(AS_TRAINED) == 1
+    assert progress.codes.count(AS_TRAINED) == 1

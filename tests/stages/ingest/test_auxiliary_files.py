@@ -122,11 +122,10 @@ def test_unused_files_are_told_and_used_when_asked(tmp_path: Path, progress: Any
         Image.fromarray(mask).save(tmp_path / f"in/mask/{index}.png")
     ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
     assert [photo.name for photo in read_photos(tmp_path / "out")] == [f"image/{index}.png" for index in range(5)]
-    assert progress.notes == [
-        "5 files are excluded, named as a mask, depth map or other copy of a photo: mask/0.png (of image/0.png), "
-        "mask/1.png (of image/1.png), mask/2.png (of image/2.png) and 2 more",
-        "to be used as a mask, whose black is ignored, mask/0.png would have to be masks/image/0.png",
-    ]
+    assert progress.codes == ["ingest.excluded", "ingest.mask-elsewhere"]
+    named = "mask/0.png (of image/0.png), mask/1.png (of image/1.png), mask/2.png (of image/2.png) and 2 more"
+    assert progress.names("ingest.excluded", "5 files", named)
+    assert progress.names("ingest.mask-elsewhere", "mask/0.png", "masks/image/0.png")
     (tmp_path / "in/masks/image").mkdir(parents=True)
     shutil.move(tmp_path / "in/mask/0.png", tmp_path / "in/masks/image/0.png")
     ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "again", progress)
@@ -156,10 +155,8 @@ def test_depth_maps_are_told_by_their_values(photo: str, depth: str, kind: type,
     ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
     assert [one.name for one in read_photos(tmp_path / "out")] == [photo.format(index) for index in range(4)]
     named = [depth.format(index) for index in range(4)]
-    assert progress.notes == [
-        "4 files are excluded as depth maps, being grey of 16 bits or of floats among photos in colour: "
-        f"{named[0]}, {named[1]}, {named[2]} and 1 more"
-    ]
+    assert progress.codes == ["ingest.depth-maps"]
+    assert progress.names("ingest.depth-maps", "4 files", f"{named[0]}, {named[1]}, {named[2]} and 1 more")
 
 
 def kinds(deep: int, grey: int, colour: int) -> dict[str, Stored]:
@@ -181,7 +178,6 @@ def test_masks_beside_photos_that_are_not_used_are_named(
     photos: str, masks: str, tmp_path: Path, progress: Any
 ) -> None:
     folder, unused = tmp_path / "in" / photos, tmp_path / "in" / masks
-    words = f"masks lie in {unused} and are not used: in {folder / 'masks'} they would be (black is ignored)"
     for index in range(2):
         put(folder / f"{index}.png", index)
     touch(unused, "notes.txt", "of another.png")
@@ -189,10 +185,11 @@ def test_masks_beside_photos_that_are_not_used_are_named(
     assert progress.notes == []
     Image.fromarray(np.eye(24, 32, dtype=np.uint8) * 255).save(unused / "0.png.png")
     ingest.run(Config(photos=folder), {}, tmp_path / "2", progress)
-    assert progress.notes == [words]
+    assert progress.codes == ["ingest.unused-masks"]
+    assert progress.names("ingest.unused-masks", unused, folder / "masks")
     unused.rename(folder / "masks")
     ingest.run(Config(photos=folder), {}, tmp_path / "3", progress)
-    assert words not in progress.notes[1:] and read_photos(tmp_path / "3")[0].mask is not None
+    assert progress.codes.count("ingest.unused-masks") == 1 and read_photos(tmp_path / "3")[0].mask is not None
 
 
 def test_cameras_beside_photos_are_named_with_their_option(tmp_path: Path, progress: Any) -> None:
@@ -204,11 +201,10 @@ def test_cameras_beside_photos_are_named_with_their_option(tmp_path: Path, progr
     for place, folder in product(("transforms.json", "sparse/0"), ("", "images")):
         if place == "sparse/0":
             touch(scene / place, "cameras.bin", "images.bin", "points3D.bin")
-        progress.notes.clear()
+        progress.clear()
         ingest.run(Config(photos=scene / folder), {}, tmp_path / "out" / place / folder, progress)
-        assert progress.notes == [
-            f"cameras lie in {scene / place} and are not used: --cameras '{scene / place}' would use them"
-        ]
+        assert progress.codes == ["ingest.unused-cameras"]
+        assert progress.names("ingest.unused-cameras", f"--cameras '{scene / place}'")
         assert find_source(scene / folder, scene / place).cameras == scene / place
 
 

@@ -57,7 +57,7 @@ def test_plain_photos_are_copied_byte_for_byte(tmp_path: Path, progress: Any) ->
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["images", "photos.json"]
     assert progress.updates[-2:] == [
         ("decoded 3 of 3 photos", 1.0),
-        ("looking for photos that are nearly the same", None),
+        ("looking for near-duplicates", None),
     ]
 
 
@@ -94,33 +94,30 @@ def test_refused_files_are_named_and_do_not_stop_the_rest(tmp_path: Path, progre
     refused = read_json(tmp_path / "out/photos.json")["rejected"]
     assert [rejection["name"] for rejection in refused] == ["cut.jpg", "notes.jpg", "z copy of a.jpg"]
     assert refused == result.facts["rejected"]
-    assert progress.notes[0].startswith("rejected cut.jpg: truncated: ")
-    assert progress.notes[1:] == [
-        "rejected notes.jpg: not an image: it is text",
-        "rejected z copy of a.jpg: identical to a.jpg",
-    ]
+    assert progress.codes == ["ingest.rejected"] * 3
+    for name, why in (("cut.jpg", "truncated"), ("notes.jpg", "text"), ("z copy of a.jpg", "identical to a.jpg")):
+        assert progress.names("ingest.rejected", name, why)
 
 
 def test_too_few_photos_in_words_that_fit(tmp_path: Path, progress: Any) -> None:
-    hint = "Take 20 to 100 overlapping photos of one scene from different places and put them into one folder."
     error = failure(put(tmp_path / "one", "a.jpg"), tmp_path / "out1", progress)
-    assert (error.what, error.why, error.hint) == ("there is only one photo", "a.jpg; a scene needs at least two", hint)
+    assert error.code == "ingest.one-photo" and "a.jpg" in error.why
 
     (tmp_path / "none").mkdir()
     (tmp_path / "none/a.jpg").write_text("text")
     error = failure(tmp_path / "none", tmp_path / "out2", progress)
-    assert error.what == f"none of the 1 files in {tmp_path}/none is a usable photo"
-    assert error.why == "a.jpg: not an image: it is text"
+    assert error.code == "ingest.no-usable-photo" and f"1 files in {tmp_path}/none" in error.what
+    assert error.why.startswith("a.jpg: ")
 
     put(tmp_path / "same", "a.png")
     (tmp_path / "same/b.png").write_bytes((tmp_path / "same/a.png").read_bytes())
     error = failure(tmp_path / "same", tmp_path / "out3", progress)
-    assert (error.what, error.why) == ("all 2 photos are identical", "they have the pixels of a.png")
+    assert error.code == "ingest.identical-photos" and "a.png" in error.why
 
     put(tmp_path / "rest", "a.jpg")
     (tmp_path / "rest/b.jpg").write_text("text")
     error = failure(tmp_path / "rest", tmp_path / "out4", progress)
-    assert (error.what, error.why) == ("only one photo can be used, a.jpg", "1 other files were rejected")
+    assert error.code == "ingest.one-usable-photo" and "a.jpg" in error.what and "1 other" in error.why
 
 
 def test_cameras_are_told_apart(tmp_path: Path, progress: Any) -> None:
@@ -184,9 +181,8 @@ def test_a_blurred_photo_is_named_and_kept(tmp_path: Path, progress: Any) -> Non
     relative = [photo.relative_sharpness for photo in read_photos(tmp_path / "out")]
     assert relative[2] is not None and 0 < relative[2] < 0.1
     assert all(one is not None and 0.5 < one < 2 for index, one in enumerate(relative) if index != 2)
-    assert progress.notes == [
-        f"1 photo is far less sharp than those before and after, and kept: 2.png ({relative[2]:.2f} ×)"
-    ]
+    assert progress.codes == ["ingest.blurred"]
+    assert progress.names("ingest.blurred", "1 photo", f"2.png ({relative[2]:.2f} ×)")
 
 
 def shifted(folder: Path, *shifts: float, blurred: int | None = None) -> Path:
@@ -206,18 +202,14 @@ def test_of_nearly_the_same_pictures_the_sharpest_goes_on(tmp_path: Path, progre
     assert [photo.near_duplicate_of for photo in photos] == ["1.png", None, None, "2.png", None]
     assert all((tmp_path / "out" / photo.file).is_file() for photo in photos)
     assert result.line == "5 photos 320×240, one camera, no EXIF focal"
-    assert progress.notes == [
-        "2 photos are nearly the same picture as another and left out of matching: 0.png (as 1.png), 3.png (as 2.png)"
-    ]
+    assert progress.codes == ["ingest.near-duplicates"]
+    assert progress.names("ingest.near-duplicates", "2 photos", "0.png (as 1.png), 3.png (as 2.png)")
 
 
 def test_photos_that_are_all_nearly_the_same_are_no_scene(tmp_path: Path, progress: Any) -> None:
     error = failure(shifted(tmp_path / "in", 0, 1, 2), tmp_path / "out", progress)
-    assert (error.what, error.why) == (
-        "all 3 photos are nearly the same picture",
-        "the camera did not move between them, so they show no depth",
-    )
-    assert error.hint.endswith(f"into one folder. {STILL_BACKGROUND_HINT}")
+    assert error.code == "ingest.same-picture" and "all 3 photos" in error.what
+    assert error.hint.endswith(STILL_BACKGROUND_HINT)
 
 
 def test_with_given_cameras_all_photos_are_used(tmp_path: Path, progress: Any) -> None:
@@ -257,10 +249,9 @@ def test_masks_go_with_their_photos(tmp_path: Path, progress: Any) -> None:
         mask = np.asarray(Image.open(tmp_path / "out" / file))
         assert photo.mask == file
         assert np.array_equal(mask, np.broadcast_to(np.where(np.arange(32) < columns, 0, 255), (24, 32)))
-    assert progress.notes == [
-        "masks/stranger.png is no photo's mask: masks are called after their photos, masks/NAME.png",
-        "masks of 3 of 6 photos ignore 42% of them, 1 turned upright like the photo, 1 made as large as the photo",
-    ]
+    assert progress.codes == ["ingest.stray-masks", "ingest.masks"]
+    assert progress.names("ingest.stray-masks", "masks/stranger.png")
+    assert progress.names("ingest.masks", "42% of 3 of 6 photos", "1 are turned", "1 are resized")
 
 
 def test_a_photo_whose_mask_cannot_be_used_is_refused(tmp_path: Path, progress: Any) -> None:
@@ -269,10 +260,9 @@ def test_a_photo_whose_mask_cannot_be_used_is_refused(tmp_path: Path, progress: 
     mask_for(folder, "masks/b.png", 32)
     ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
     assert [photo.name for photo in read_photos(tmp_path / "out")] == ["c.png", "d.png"]
-    assert progress.notes == [
-        "rejected a.png: its mask a.png does not fit: it is 30×30 and the photo 32×24",
-        "rejected b.png: its mask b.png ignores all of it (its brightest value is 0 of 255)",
-    ]
+    assert progress.codes == ["ingest.rejected", "ingest.rejected"]
+    assert progress.names("ingest.rejected", "a.png", "30×30", "32×24")
+    assert progress.names("ingest.rejected", "b.png", "0 of 255")
 
 
 def test_a_video_becomes_photos_with_times(tmp_path: Path, progress: Any) -> None:
@@ -311,14 +301,14 @@ def test_odd_names_stay_inside_and_become_ascii(tmp_path: Path, progress: Any) -
     for photo in photos:
         assert (tmp_path / "out" / photo.file).resolve().is_relative_to(tmp_path / "out/images")
         assert (tmp_path / "out" / photo.file).is_file()
-    assert progress.notes == ["rejected \\xff.jpg: damaged: its header cannot be read (Truncated File Read)"]
+    assert progress.codes == ["ingest.rejected"] and progress.names("ingest.rejected", "\\xff.jpg", "Truncated File")
 
 
 def test_terminal_codes_in_names_are_not_printed(tmp_path: Path, progress: Any) -> None:
     put(tmp_path / "in", "a.jpg", "b.jpg")
     (tmp_path / "in/\x1b[2J.jpg").write_text("text")
     ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
-    assert progress.notes == [r"rejected '\x1b[2J.jpg': not an image: it is text"]
+    assert progress.codes == ["ingest.rejected"] and progress.names("ingest.rejected", r"'\x1b[2J.jpg'")
 
 
 def test_only_photos_named_by_the_cameras_are_taken(tmp_path: Path, progress: Any) -> None:
@@ -335,7 +325,7 @@ def test_only_photos_named_by_the_cameras_are_taken(tmp_path: Path, progress: An
     ]
     assert read_frame_names(tmp_path / "out")["images/a"] == "images/a.png"
     assert result.line == "3 photos 32×24, poses imported, 1 rejected"
-    assert progress.notes == ["rejected images/gone.png: there is no such file"]
+    assert progress.codes == ["ingest.rejected"] and progress.names("ingest.rejected", "images/gone.png")
 
 
 def test_what_is_opaque_is_noted(tmp_path: Path, progress: Any) -> None:
@@ -368,7 +358,7 @@ def test_a_full_disk_is_said_in_words(tmp_path: Path, progress: Any, monkeypatch
 
     monkeypatch.setattr("shutil.copyfile", full)
     error = failure(put(tmp_path / "in", "a.jpg", "b.jpg"), tmp_path / "out", progress)
-    assert error.what == f"cannot write the photos to {tmp_path}/out"
+    assert error.code == "ingest.cannot-write" and str(tmp_path / "out") in error.what
     assert error.why == "No space left on device"
 
 

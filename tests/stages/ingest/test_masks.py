@@ -99,7 +99,7 @@ def test_of_labels_all_but_zero_is_used(bits: int, values: tuple[int, int], tmp_
 def test_what_compression_leaves_of_black_is_no_label(tmp_path: Path) -> None:
     file = tmp_path / "m.jpg"
     Image.fromarray(np.random.default_rng(0).integers(0, 9, (HEIGHT, WIDTH), np.uint8)).save(file)
-    assert "ignores all of it" in reason(file)
+    assert "ignores the whole photo" in reason(file)
 
 
 def test_a_picture_that_is_cut_out_masks_by_its_alpha(tmp_path: Path) -> None:
@@ -198,8 +198,7 @@ def test_masks_of_half_turned_photos_follow_their_shapes(
     ingest.run(ingest.Config(photos=folder), {}, tmp_path / "out", progress)
     mask = np.asarray(Image.open(tmp_path / "out" / str(read_photos(tmp_path / "out")[0].mask)))
     assert np.array_equal(mask[0] == 0, np.arange(32) >= 24 if turned else np.arange(32) < 8)
-    fit = "masks of 2 photos fit upright and as stored alike (EXIF orientation), and are taken as upright"
-    assert (f"{fit}: look at masks/ of 0.jpg, 1.jpg" in progress.notes) == noted
+    assert progress.names("ingest.ambiguous-masks", "2 photos", "0.jpg, 1.jpg") == noted
 
 
 def test_masks_of_both_kinds_tell_nothing_of_others(tmp_path: Path) -> None:
@@ -231,12 +230,11 @@ def test_any_reduction_rounded_to_pixels_keeps_its_shape(width: int, height: int
 
 
 def test_an_unusable_mask_refuses_its_photo(tmp_path: Path) -> None:
-    assert reason(saved(tmp_path, ignoring(5, 5, 40, 40))) == (
-        "its mask m.png does not fit: it is 40×40 and the photo 48×32"
-    )
+    unlike = reason(saved(tmp_path, ignoring(5, 5, 40, 40)))
+    assert unlike.startswith("its mask m.png ") and "40×40" in unlike and "48×32" in unlike
     assert reason(saved(tmp_path, ignoring(5, 5, HEIGHT, WIDTH))).startswith("its mask m.png does not fit")
     black = saved(tmp_path, np.zeros((HEIGHT, WIDTH), np.uint8))
-    assert reason(black) == "its mask m.png ignores all of it (its brightest value is 0 of 255)"
+    assert reason(black).startswith("its mask m.png ") and "0 of 255" in reason(black)
     hidden = np.dstack([np.zeros((HEIGHT, WIDTH, 3), np.uint8), ignoring(5, 5)])
     assert reason(saved(tmp_path, hidden)).endswith("0 of 255, where it is not transparent)")
     (tmp_path / "t.png").write_text("text")

@@ -31,8 +31,8 @@ def test_at_most_ten_refusals_are_said(tmp_path: Path, progress: Any) -> None:
     for index in range(13):
         (folder / f"x{index:02d}.jpg").write_bytes(b"")
     ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
-    assert len(progress.notes) == 11
-    assert progress.notes[-1] == "… and 3 more, all in photos.json"
+    assert progress.codes == [*["ingest.rejected"] * 10, "ingest.more-notes"]
+    assert progress.names("ingest.more-notes", 3, "photos.json")
 
 
 def test_all_notes_are_kept(tmp_path: Path, progress: Any) -> None:
@@ -47,9 +47,10 @@ def test_all_notes_are_kept(tmp_path: Path, progress: Any) -> None:
     notes = read_json(tmp_path / "out/notes.json")
     assert notes[:10] == progress.notes[:10] and len(notes) == 12
     strays = "masks/stray0.png, masks/stray1.png, masks/stray2.png and 4 more"
-    assert notes[0] == f"{strays} are no photo's mask: masks are called after their photos, masks/NAME.png"
+    assert progress.codes[:11] == ["ingest.stray-masks", *["ingest.assumed"] * 9, "ingest.more-notes"]
+    assert progress.names("ingest.stray-masks", strays)
     assert notes[1].startswith("c00.tif: ")
-    assert progress.notes[10] == "… and 2 more, all in notes.json"
+    assert progress.names("ingest.more-notes", 2, "notes.json")
 
 
 def test_masks_beside_photos_are_used_strays_told_once(tmp_path: Path, progress: Any) -> None:
@@ -59,15 +60,15 @@ def test_masks_beside_photos_are_used_strays_told_once(tmp_path: Path, progress:
         Image.fromarray(np.eye(24, 32, dtype=np.uint8) * 255).save(tmp_path / "in/masks" / name)
     ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
     assert [photo.mask is not None for photo in read_photos(tmp_path / "out")] == [True, False]
-    assert sum("masks/stray.png is no photo's mask" in note for note in progress.notes) == 1
+    assert progress.codes.count("ingest.stray-masks") == 1 and progress.names("ingest.stray-masks", "masks/stray.png")
 
 
 def test_photos_beside_an_images_folder_are_said(tmp_path: Path, progress: Any) -> None:
     put(tmp_path / "in/images", "a.jpg", "b.jpg")
     put(tmp_path / "in", "c.jpg", "d.jpg")
     ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
-    how = f"to use all, move them into images/; to use only them, move images/ out of {tmp_path}/in"
-    assert progress.notes == [f"2 photos lie in {tmp_path}/in beside images/ and are not used: {how}"]
+    assert progress.codes == ["ingest.photos-beside-images"]
+    assert progress.names("ingest.photos-beside-images", "2 photos", f"{tmp_path}/in", "images/")
 
 
 def test_where_it_fails_all_refusals_are_said_by_reason(tmp_path: Path, progress: Any) -> None:
@@ -79,11 +80,10 @@ def test_where_it_fails_all_refusals_are_said_by_reason(tmp_path: Path, progress
     with refused("ingest.one-usable-photo"):
         ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
     names = ", ".join(f"x{index:02d}.jpg" for index in range(12))
-    assert progress.notes == [
-        f"rejected {names}: not an image: it is text",
-        "rejected y.jpg: identical to a.jpg",
-        "masks/stray.png is no photo's mask: masks are called after their photos, masks/NAME.png",
-    ]
+    assert progress.codes == ["ingest.rejected-photos", "ingest.rejected-photos", "ingest.stray-masks"]
+    assert progress.names("ingest.rejected-photos", names)
+    assert progress.names("ingest.rejected-photos", "y.jpg", "a.jpg")
+    assert progress.names("ingest.stray-masks", "masks/stray.png")
 
 
 def test_a_photo_too_large_for_memory_is_named(tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,5 +102,5 @@ def test_twelve_bits_in_files_of_sixteen_are_said(tmp_path: Path, progress: Any,
         grey = np.random.default_rng(index).integers(0, most, (24, 32), np.uint16, endpoint=True)
         Image.fromarray(grey).save(tmp_path / f"{index}.png")
     ingest.run(Config(photos=tmp_path), {}, tmp_path / "out", progress)
-    how = "if their values are of 10 or 12 bits in files of 16, scale them up first, those of 12 by 16"
-    assert progress.notes == [f"all photos are nearly black, at most 16 of 255: {how}"] * dark
+    assert progress.codes == ["ingest.nearly-black"] * dark
+    assert progress.names("ingest.nearly-black", "16 of 255") == dark

@@ -66,7 +66,7 @@ def test_it_holds_what_was_loaded(tmp_path: Path, progress: SilentProgress, chan
     assert np.array_equal(table.numpy(), np.concatenate([pixels.reshape(-1, channels) for pixels in expected]))
     for index, pixels in enumerate(expected):
         assert np.array_equal(kept(store, index), pixels)
-    assert progress.updates[-1] == ("read 4 of 4 photos, the disk is taking 0 MB", 1.0)
+    assert progress.updates[-1] == ("read 4 of 4 photos, writing 0 MB to the disk", 1.0)
     assert progress.notes == []
 
 
@@ -109,7 +109,8 @@ def test_a_damaged_store_is_made_again_and_said(tmp_path: Path, progress: Silent
     assert not store.is_whole
     fill(store, painted, progress)
     assert np.array_equal(kept(store, 2), painted(2))
-    assert progress.notes == [f"the pixel store {store.path.name} has {size:,} bytes and not 256: making it again"]
+    assert progress.codes == ["io.pixel-store-rebuilt"]
+    assert progress.names("io.pixel-store-rebuilt", store.path.name, f"{size:,} bytes", 256)
 
 
 def test_photos_are_decoded_a_few_at_a_time_and_dropped(tmp_path: Path, progress: SilentProgress) -> None:
@@ -144,7 +145,7 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path, progress: SilentProgres
     store = store_of(tmp_path)
     with pytest.raises(OSError, match="truncated"):
         fill(store, fails, progress)
-    with pytest.raises(ValueError, match=r"0\.png has shape \(3, 5\) and not \(3, 5, 3\)"):
+    with pytest.raises(ValueError, match=r"0\.png has shape \(3, 5\) instead of \(3, 5, 3\)"):
         fill(store, lambda index: painted(index)[..., 0], progress)
     assert [path.suffix for path in store.path.parent.iterdir()] == [".lock"]
     fill(store, painted, progress)
@@ -157,9 +158,8 @@ def test_no_room_is_said_before_anything_is_decoded(tmp_path: Path, progress: Si
     store = pixel_store(tmp_path / "ingest", "train", [StoredPhoto("a", 10**7, 10**7)], 3)
     with pytest.raises(StageError) as caught:
         fill(store, never, progress)
-    assert caught.value.what == "no room for the pixels of the photos"
-    assert caught.value.why.startswith(f"they take 279396.8 GB at this size, and {store.path.parent} has ")
-    assert caught.value.hint == "Free disk space, or give a larger --train.downscale."
+    assert caught.value.code == "io.no-room-for-pixels"
+    assert "279396.8 GB" in caught.value.why and str(store.path.parent) in caught.value.why
     assert not store.path.exists()
 
 
@@ -168,9 +168,8 @@ def test_more_than_memory_is_said(tmp_path: Path, progress: SilentProgress, monk
     fill(store, painted, progress)
     monkeypatch.setattr("stages.io.pixel_store.FITS", 0.0)
     assert np.array_equal(store.table(progress)[:15].numpy(), painted(0).reshape(-1, 3))
-    assert len(progress.notes) == 1
-    assert progress.notes[0].startswith("the photos take 0 MB at this size, ")
-    assert progress.notes[0].endswith("training waits for the disk; a larger --train.downscale will not")
+    assert progress.codes == ["io.photos-exceed-memory"]
+    assert progress.names("io.photos-exceed-memory", "0 MB", "--train.downscale")
 
 
 def test_a_second_process_waits_and_finds_it_made(tmp_path: Path, progress: SilentProgress) -> None:
@@ -187,7 +186,7 @@ def test_a_second_process_waits_and_finds_it_made(tmp_path: Path, progress: Sile
     lock.release()
     waiting.join(10)
     assert not waiting.is_alive()
-    assert {message for message, _ in progress.updates} == {"waiting for another program that reads the same photos"}
+    assert {message for message, _ in progress.updates} == {"waiting for another process that reads the same photos"}
 
 
 KILLED = """
@@ -226,7 +225,7 @@ def test_a_flipped_bit_is_found_said_and_made_again(tmp_path: Path, progress: Si
         assert len(store.damaged()) == 1
         fill(store, painted, progress)
         assert store.path.read_bytes() == sound
-    assert [note.endswith("have changed on the disk: making it again") for note in progress.notes] == 3 * [True]
+    assert progress.codes == 3 * ["io.pixels-changed"]
 
 
 def flipped(content: bytes, bit: int) -> bytes:

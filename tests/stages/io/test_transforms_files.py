@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages.contract import StageError
 from stages.io.photos import Photo
 from stages.io.transforms_files import read_transforms
 from stages.sfm.imported.pose_files import ImportedPoses, read_poses
@@ -87,14 +86,10 @@ def test_test_frames_of_one_file_are_test_photos(tmp_path: Path) -> None:
     found = read_poses(file, PHOTOS, NAMES)
     assert found.test_files is None
     assert found.notes[-1].code == REPEATS
-    for wrong, why in (
-        ({}, "it is no list"),
-        ([{}], "frame 0 has no file_path and no transform_matrix: it has nothing"),
-    ):
+    for wrong, code in (({}, "io.transforms-split"), ([{}], "io.transforms-incomplete-frame")):
         file.write_text(json.dumps({**LENS, "frames": TRAIN, "test_frames": wrong}))
-        with pytest.raises(StageError) as raised:
+        with refused(code, "test_frames of transforms.json"):
             read_poses(file, PHOTOS, NAMES)
-        assert (raised.value.what, raised.value.why) == ("cannot use test_frames of transforms.json", why)
 
 
 def test_a_file_without_frames_is_no_path_to_render(tmp_path: Path) -> None:

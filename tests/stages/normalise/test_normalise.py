@@ -9,7 +9,6 @@ import pytest
 from nerf.geometry.camera_paths import nearest_rotations
 from nerf.geometry.scene import Camera
 from stages import normalise
-from stages.contract import StageError
 from stages.io.files import read_json, read_scene, read_tensors
 from stages.io.photos import Box, Photo, read_photos, write_photos
 from stages.normalise.scene_frame import _within
@@ -132,44 +131,37 @@ def test_alpha_makes_the_background_known(inputs, progress) -> None:
 
 
 @pytest.mark.parametrize(
-    ("transparent", "has_alpha", "note"),
-    [
-        (16, True, "1 of 17 photos have no transparent parts: taken as opaque everywhere"),
-        (1, False, "transparent parts of 1 of 17 photos are ignored like masked ones: most photos have none"),
-    ],
+    ("transparent", "has_alpha", "code"), [(16, True, "opaque-photos"), (1, False, "alpha-ignored")]
 )
-def test_most_photos_decide_on_alpha_and_exceptions_are_named(inputs, progress, transparent, has_alpha, note) -> None:
+def test_most_photos_decide_on_alpha_and_exceptions_are_named(inputs, progress, transparent, has_alpha, code) -> None:
     folders = inputs(transparent=transparent)
     run(folders, progress)
     scene = read_scene(folders["normalise"])
-    assert (scene.has_alpha, scene.bounded, progress.notes) == (has_alpha, has_alpha, [note])
+    assert (scene.has_alpha, scene.bounded, progress.codes) == (has_alpha, has_alpha, [f"normalise.{code}"])
+    assert progress.names(f"normalise.{code}", "1 of 17 photos")
     assert [view.mask for view in scene.views] == [
         f"opaque/{i:02d}.png" if not has_alpha and i < transparent else None for i in range(17)
     ]
 
 
-CROPPED = "transparent parts of 17 of 17 photos are ignored like masked ones: what is opaque is seen whole in few"
-BEYOND = " of what is tracked lies beyond what the photos' alpha leaves"
-
-
 @pytest.mark.parametrize(
-    ("opaque", "around", "says"),
+    ("opaque", "around", "code"),
     [
-        ((0.0, 0.0, 1.0, 1.0), 0.0, CROPPED),
-        ((0.0, 0.3, 1.0, 1.0), 0.0, CROPPED),
-        ((0.2, 0.3, 0.8, 1.0), 20.0, BEYOND),
+        ((0.0, 0.0, 1.0, 1.0), 0.0, "alpha-ignored"),
+        ((0.0, 0.3, 1.0, 1.0), 0.0, "alpha-ignored"),
+        ((0.2, 0.3, 0.8, 1.0), 20.0, "alpha-beyond-region"),
     ],
     ids=["empty corners", "no sky", "the distance"],
 )
 def test_alpha_is_no_background_where_the_scene_goes_on(
-    inputs, progress, opaque: Box, around: float, says: str
+    inputs, progress, opaque: Box, around: float, code: str
 ) -> None:
     folders = inputs(transparent=17, opaque=opaque, around=around)
     assert "background unbounded" in run(folders, progress).line
     scene = read_scene(folders["normalise"])
     assert not scene.has_alpha and not scene.bounded
     assert [view.mask for view in scene.views] == [f"opaque/{i:02d}.png" for i in range(17)]
-    assert len(progress.notes) == 1 and says in progress.notes[0]
+    assert progress.codes == [f"normalise.{code}"]
 
 
 @pytest.mark.parametrize("opaque", [None, (0.2, 0.3, 0.8, 1.0), (0.0, 0.3, 1.0, 0.9)])
@@ -259,12 +251,8 @@ def test_a_given_region_replaces_the_automatic_one(inputs, progress) -> None:
 
 
 def test_two_photos_are_too_few(inputs, progress) -> None:
-    with pytest.raises(StageError) as error:
+    with refused("normalise.few-photos", "2 photos", 3):
         run(inputs(2), progress)
-    assert str(error.value) == (
-        "only 2 photos with a known camera: a scene needs at least 3: two to train on and one to test on. "
-        "Add photos that overlap with these."
-    )
 
 
 def test_a_region_without_size_is_refused(inputs, progress) -> None:
@@ -273,7 +261,7 @@ def test_a_region_without_size_is_refused(inputs, progress) -> None:
 
 
 def test_photos_from_one_place_are_refused_with_a_hint(inputs, progress) -> None:
-    with refused("normalise.no-scale", "all cameras stand in one place"):
+    with refused("normalise.no-scale", "the same position"):
         run(inputs(one_place=True), progress)
 
 

@@ -275,8 +275,8 @@ def test_blender_angles_are_understood_without_sizes(tmp_path: Path) -> None:
         ({"transform_matrix": [[1, 2], [3, 4]]}, "cannot use frame 0 of t.json: its transform_matrix is not 4 × 4"),
         ({"transform_matrix": 7}, "cannot use frame 0 of t.json: its transform_matrix is not 4 × 4"),
         ({"transform_matrix": None}, "cannot use frame 0 of t.json: its transform_matrix is not"),
-        ({"transform_matrix": np.zeros((4, 4)).tolist()}, "its transform_matrix mirrors, or has no volume"),
-        ({"transform_matrix": np.eye(4).tolist(), "fl_x": -3}, "a focal length of -3 × -3 pixels is not one"),
+        ({"transform_matrix": np.zeros((4, 4)).tolist()}, "its transform_matrix mirrors or is singular"),
+        ({"transform_matrix": np.eye(4).tolist(), "fl_x": -3}, "a focal length of -3 × -3 pixels"),
     ],
 )
 def test_unusable_frames_are_named(frame, words: str, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ CAMERA_MODELS = [
     for model, place, free, error, worse, noise, reason in [
         ("SIMPLE_RADIAL", "fixed", 2, 0.6912, 0.0812, 0.0101, None),
         ("OPENCV", "refined", 8, 0.6100, 0.0, 0.0, None),
-        ("OPENCV_FISHEYE", "refined", 8, None, None, None, "its distortion cannot be undone at 2.0% of the pixels"),
+        ("OPENCV_FISHEYE", "refined", 8, None, None, None, "its distortion has no inverse at 2.0% of the pixels"),
     ]
 ]
 SPANS = {"profiled_steps": 19, "seconds": 5.0, "core_seconds": 10.0, "efficiency": 0.6} | {
@@ -157,7 +157,7 @@ def _write_metrics(folder: Path, scene: Scene, size: tuple[int, int]) -> None:
     }
     words = {
         "notes": [{"code": "evaluate.no-lpips", "text": "LPIPS is not computed"}],
-        "verdict": "Better than the nearest training photo by 7.3 dB but soft.",
+        "verdict": "Better than the nearest training view by 7.3 dB but soft.",
     }
     write_json(folder / "metrics.json", {"psnr_interval": [21.1, 21.9], "images": images} | overall | counts | words)
 

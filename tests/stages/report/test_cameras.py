@@ -175,7 +175,7 @@ def test_doubtful_cameras_come_first_with_photos_by_their_own_names(
     change(inputs, check=check(doubtful=png(range(10)), weak_links=[link]))
     html, summary = written(inputs, tmp_path / "out", progress)
     assert summary["cameras_doubtful"] and summary["cameras_verdict"].startswith("The cameras are doubtful: ")
-    assert summary["verdict"] == "Better than the nearest training photo by 7.3 dB but soft."
+    assert summary["verdict"] == "Better than the nearest training view by 7.3 dB but soft."
     assert html.index("The cameras are doubtful: ") < html.index("<h1>") and "The cameras are doubtful" not in calm
     shown = re.findall(r'<figure><img src="data:image/jpeg[^"]*" alt="([^"]*)"><figcaption>', html)
     assert shown == [*(f"IMG_{i:04d}.jpg" for i in range(8)), "IMG_0020.jpg", "IMG_0021.jpg"]

@@ -1,4 +1,4 @@
-"""The page on effects: what the photos call for, and how unseen photos are exposed and posed for each score."""
+"""The page on effects: what the photos call for, and how test photos are exposed and posed for each score."""
 
 import json
 import re
@@ -77,7 +77,7 @@ def test_page_shows_what_the_photos_call_for(tmp_path: Path, progress: Any):
     write_json(inputs["effects"] / "manifest.json", manifest | {"stage": "effects", "config": {}, "facts": {}})
     write_json(inputs["effects"] / "effects.json", EFFECTS)
     html, _ = written(inputs, tmp_path / "out", progress)
-    section = html[html.index("Effects of these photos") : html.index("Where the cameras stood")]
+    section = html[html.index("Effects of these photos") : html.index('<section id="cameras">')]
     cells = re.findall(r"<t[dh](?: [^>]*)?>(.*?)</t[dh]>", section)
     rows = [cells[i : i + 9] for i in range(0, len(cells), 9)]
     assert rows[0] == [
@@ -112,7 +112,7 @@ def test_page_shows_the_curve_of_each_cameras_vignetting(tmp_path: Path, progres
     rows = {"a.png": [0.4, 0.1, 0.1, 0.2], "b.png": [0.4, 0.1, 0.1, 0.2], "c.png": [0.4, 0.0, 0.0, 0.1]}
     write_json(inputs["train"] / "field.json", field | {"effects": {"vignetting": rows}})
     html, _ = written(inputs, tmp_path / "out", progress)
-    drawn = html[html.index('aria-label="gain against') : html.index("Vignetting as it was learnt")]
+    drawn = html[html.index('aria-label="gain against') : html.index("Learnt vignetting")]
     assert drawn.count(BLUE) == 2, "two cameras"
     write_json(inputs["train"] / "field.json", field | {"effects": {}})
     assert "Vignetting as it was learnt" not in written(inputs, tmp_path / "without", progress)[0]

@@ -49,7 +49,7 @@ def test_plots_are_well_formed_and_the_same_twice():
     xyz = np.random.default_rng(0).normal(0, 0.4, (500, 3))
     rgb = np.random.default_rng(1).integers(0, 255, (500, 3))
     for draw in (
-        lambda: curve_svg(_curve(), {"nearest photo": 14.2}),
+        lambda: curve_svg(_curve(), {"nearest training view": 14.2}),
         lambda: "".join(camera_svgs(_scene(), _scene().views, xyz, rgb, True).values()),
     ):
         svg = draw()
@@ -80,8 +80,8 @@ def test_the_curve_shows_prediction_and_knee():
 
 
 def test_curve_names_its_lines_and_needs_two_points():
-    svg = curve_svg(_curve(), {"nearest photo": 14.2, "mean image": None}) or ""
-    assert "nearest photo" in svg and "14.2 dB" in svg and "mean image" not in svg
+    svg = curve_svg(_curve(), {"nearest training view": 14.2, "mean image": None}) or ""
+    assert "nearest training view" in svg and "14.2 dB" in svg and "mean image" not in svg
     assert curve_svg(_curve()[:1], {}) is None
     assert curve_svg([], {}) is None
 
@@ -96,7 +96,7 @@ def test_the_prediction_lies_inside_the_plot(monkeypatch: pytest.MonkeyPatch):
     tops: list[float] = []
     monkeypatch.setattr(plots, "svg_element", lambda figure: str(tops.append(figure.axes[0].get_ylim()[1])))
     curve, coming = _curve(), PredictedGain(8.0, 0.5)
-    curve_svg(curve, {"nearest photo": 14.2}, coming)
+    curve_svg(curve, {"nearest training view": 14.2}, coming)
     assert curve[-1]["probe_psnr"] + 8.5 <= tops[0] < 40
 
 

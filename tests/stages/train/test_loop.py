@@ -291,7 +291,8 @@ def test_a_target_that_was_reached_does_not_end_more_steps(tmp_path: Path, progr
     more = more_towards(tmp_path / "more", progress, 20.0, tmp_path / "first")
     assert more.state.step == first.state.step + 600 and more.schedule.progress(more.state.step) == pytest.approx(1)
     assert reasons(more) == [*reasons(first), "more"]
-    assert progress.notes.count("20 dB are reached already: training uses the whole additional budget") == 1
+    assert progress.codes.count("train.target-reached-before") == 1
+    assert progress.names("train.target-reached-before", "20 dB")
     assert more.state.pending_target(20.0) is None and first.state.pending_target(20.0) == 20.0
 
 

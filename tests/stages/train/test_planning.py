@@ -217,9 +217,8 @@ def test_unbounded_space_without_alpha_has_a_background(scene: Scene, space: Spa
 
 
 def test_the_reason_for_sizes_is_the_budget() -> None:
-    said = "100 steps render about 1.0 M rays and evaluate 3.0 M colours: open sizes are chosen for that"
-    assert reason(GRID, 1e6) == said
-    assert reason(VANILLA, 950) == "10 s on this machine render about 950 rays: open sizes are chosen for that"
+    assert reason(GRID, 1e6).startswith("100 steps render about 1.0 M rays and evaluate 3.0 M colours")
+    assert reason(VANILLA, 950).startswith("10 s on this machine render about 950 rays")
 
 
 FOLDED = GRID.model_copy(update={"space": "contracted", "downscale": 1.0})
@@ -245,8 +244,9 @@ def test_grids_take_half_of_the_free_memory_at_most(
     monkeypatch.setattr("stages.train.fields.hash_grid.available_on", {"cpu": free}.get)
     config = with_grid(FOLDED, **own)
     assert sizes_of(config, of_size(scene, 4000, 3000), 1e9, progress) == chosen | own
-    said = "5 grids of up to 2^{log2_hashmap_size} rows: 6 grids of up to 2^18 rows, which the budget could fill, take "
-    assert [note.startswith(said.format(**chosen)) for note in progress.notes] == [True] * (chosen is not LARGEST)
+    assert progress.codes == ["train.memory-limits-grids"] * (chosen is not LARGEST)
+    got = f"5 grids of up to 2^{chosen['log2_hashmap_size']} rows"
+    assert progress.names("train.memory-limits-grids", got, "6 grids of up to 2^18 rows") == (chosen is not LARGEST)
 
 
 @pytest.mark.parametrize(
@@ -266,5 +266,5 @@ def test_pixels_take_half_of_a_gpus_memory(
     monkeypatch.setattr("stages.train.planning.available_on", {"cuda": free}.get)
     large = replace(of_size(scene, 2000, 1000), has_alpha=has_alpha)  # six photos, 36 MB without alpha
     assert chosen_downscale(large, 12e6, progress=progress) == downscale
-    said = f"photos at 1/{downscale:g} of their size: at 1/1, which the budget could make use of, their pixels take "
-    assert [note.startswith(said) for note in progress.notes] == [True] * (downscale > 1)
+    assert progress.codes == ["train.memory-limits-photos"] * (downscale > 1)
+    assert progress.names("train.memory-limits-photos", f"photos at 1/{downscale:g}", "at 1/1") == (downscale > 1)

@@ -22,7 +22,7 @@ TINY: dict[str, Any] = {
     "downscale": 1.0,
 }
 FAST, INEXACT, NOTHING = MediumPrecision(2.53, 1.2e-5), MediumPrecision(4.0, 3e-4), MediumPrecision(1.0, 2e-7)
-SAID = "matrix products at torch's precision medium: 2.5 times faster here, off by 1e-05"
+SAID = "train.matmul-medium"
 
 
 @pytest.fixture
@@ -63,7 +63,8 @@ def test_a_run_in_seconds_takes_what_pays(
     widths = here(medium)
     assert chosen_precision(Config(seconds=5, field="grid"), progress) == chosen
     assert chosen_precision(Config(seconds=5, vanilla=VanillaOptions(width=48)), progress) == chosen
-    assert progress.notes == 2 * notes and widths == [64, 48]
+    assert progress.codes == 2 * notes and widths == [64, 48]
+    assert progress.names(SAID, "2.5 times faster", "1e-05") == bool(notes)
 
 
 def test_a_run_in_steps_depends_on_no_measurement(here, progress) -> None:
@@ -76,7 +77,7 @@ def test_planning_keeps_the_choice_and_what_was_asked_for(tmp_path: Path, here, 
     inputs, _ = photographed(tmp_path)
     here(FAST)
     planned = train.plan(Config(**TINY, seconds=5), inputs, progress)
-    assert planned.matmul == "medium" and progress.said("train.matmul-medium") == [SAID]
+    assert planned.matmul == "medium" and progress.codes.count(SAID) == 1
     here(NOTHING)
     assert train.plan(planned, inputs, progress) == planned
     assert train.plan(Config(**TINY, steps=5, matmul="medium"), inputs, progress).matmul == "medium"
@@ -108,5 +109,5 @@ def test_products_that_are_inexact_on_another_machine_are_said(tmp_path: Path, h
     for matmul in ("medium", "highest"):
         (tmp_path / matmul).mkdir()
         run_stage(train, Config(**TINY, steps=1, matmul=matmul), inputs, tmp_path / matmul, progress)
-    said = [note for note in progress.notes if note.startswith("matrix products")]
-    assert said == ["matrix products are off by 3e-04 here; --train.matmul highest computes exact ones"]
+    assert progress.codes.count("train.matmul-inexact") == 1
+    assert progress.names("train.matmul-inexact", "3e-04", "--train.matmul highest")

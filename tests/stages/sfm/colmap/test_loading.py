@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 ENCODE = """
 import io, sys
 import numpy as np
@@ -21,3 +23,22 @@ print("encoded")
 def test_pillow_writes_png_after_colmap_was_used():
     done = subprocess.run([sys.executable, "-c", ENCODE], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0 and done.stdout == "encoded\n", done.stderr
+
+
+SPOILT = """
+import pycolmap
+import numpy as np
+from pathlib import Path
+from stages.contract import StageError
+from stages.io.files import write_png
+try:
+    write_png(Path("never.png"), np.zeros((400, 600), np.uint8))
+except StageError as error:
+    print(error.code)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="libraries share symbols on Linux alone")
+def test_pycolmap_before_pillow_is_refused_without_hanging():
+    done = subprocess.run([sys.executable, "-c", SPOILT], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and done.stdout == "io.pycolmap-before-pillow\n", done.stderr

@@ -101,7 +101,7 @@ def test_lack_of_room_is_told_and_the_model_stands(how: str, monkeypatch: pytest
     assert len(pose_uncertainty_px(model, 0.5)) == PHOTOS
     if how == "foreseen":
         monkeypatch.setattr(uncertainty, "available_bytes", lambda: room - 1)
-        words = "it would take 0 MB and 0 MB are free"
+        words = "0 MB are free"
     else:
         monkeypatch.setattr(uncertainty, "_whitened_covariance", Mock(side_effect=MemoryError()))
         words = "memory ran out"

@@ -234,20 +234,20 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"transform_matrix": np.diag([1, 1, 0, 1]).tolist()}, r"it is no rotation: its determinant is 0"),
         (
             {"transform_matrix": matrix(1).T.tolist()},
-            r"the last row .* is 1, 2, -1, 1 and not 0, 0, 0, 1: it may be trans",
+            r"the last row .* is 1, 2, -1, 1 .*: it may be trans",
         ),
-        ({"camera_angle_x": 40, "fl_x": None}, r"its camera_angle_x is 40 and should be in radians, between 0"),
-        ({"intrinsics": [[50, 0, 31], [0, 50, 19]]}, r"its intrinsics has 6 numbers, not the 3 × 3"),
+        ({"camera_angle_x": 40, "fl_x": None}, r"its camera_angle_x is 40; it must be in radians"),
+        ({"intrinsics": [[50, 0, 31], [0, 50, 19]]}, r"its intrinsics has 6 numbers"),
         ({"intrinsics": [50, 9, 31, 0, 50, 19, 0, 0, 1]}, r"its intrinsics is no camera matrix .*: 50 9 31; 0 50"),
-        ({"fl_x": 0}, r"a focal length of 0 × 0 pixels is not one for a picture of 60×40"),
-        ({"fl_x": -50}, r"a focal length of -50 × -50 pixels is not one"),
-        ({"fl_x": 1e308}, r"a focal length of 1e\+308 × 1e\+308 pixels is not one"),
-        ({"fl_x": 1e-300}, r"a focal length of 1e-300 × 1e-300 pixels is not one"),
+        ({"fl_x": 0}, r"a focal length of 0 × 0 pixels is .*60×40"),
+        ({"fl_x": -50}, r"a focal length of -50 × -50 pixels"),
+        ({"fl_x": 1e308}, r"a focal length of 1e\+308 × 1e\+308 pixels"),
+        ({"fl_x": 1e-300}, r"a focal length of 1e-300 × 1e-300 pixels"),
         ({"fl_x": 10**400}, r"its fl_x is 10{39}, not a finite number"),
-        ({"cx": -1e300}, r"its principal point \(-1e\+300, 20\) is far outside of its 60×40"),
+        ({"cx": -1e300}, r"its principal point \(-1e\+300, 20\) is .*60×40"),
         ({"w": 10**30, "h": 10**30}, r"its w and h are 1e\+30 and 1e\+30"),
         ({"transform_matrix": _with(0, 3, 1e300)}, r"its position is 1e\+300 units from the origin"),
-        ({"transform_matrix": _with(0, 0, 1e308)}, r"it is no rotation: 1e\+308 is in it"),
+        ({"transform_matrix": _with(0, 0, 1e308)}, r"it is no rotation: .*1e\+308"),
         ({"transform_matrix": _with(0, 0, 10**400)}, r"its transform_matrix is not a matrix of numbers"),
         ({"fl_x": math.nan}, r"its fl_x is nan, not a finite number"),
         ({"cx": "31 px"}, r"its cx is '31 px', not a finite number"),
@@ -255,25 +255,22 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"k1": "nan"}, r"its k1 is 'nan', not a finite number"),
         ({"k1": True}, r"its k1 is True, not a finite number"),
         ({"w": 0, "h": 0}, r"its w and h are 0 and 0"),
-        ({"w": 80, "h": 40}, r"it is for 80×40 pixels, the photo has 60×40"),
-        ({"k4": 0.1}, r"it has a k4, and its camera_model is not FULL_OPENCV"),
+        ({"w": 80, "h": 40}, r"80×40 pixels, .*60×40"),
+        ({"k4": 0.1}, r"k4, .*FULL_OPENCV"),
         ({"camera_model": "EQUIRECTANGULAR"}, r"panoramas are not supported"),
         ({"camera_model": "FISHEYE624"}, r"its camera_model is 'FISHEYE624', which is none of SIMPLE_PIN"),
         ({"camera_model": "ORTHOPHOTO"}, r"its camera_model is 'ORTHOPHOTO', which is none of"),
         ({"camera_model": "VR180_L"}, r"its camera_model is 'VR180_L', which is none of"),
         ({"camera_model": "RAD_TAN_THIN_PRISM_FISHEYE"}, r"its camera_model is 'RAD_TAN_THIN_PRISM_FISHEYE', which is"),
         ({"camera_model": ["OPENCV"]}, r"its camera_model is \['OPENCV'\], which is none of"),
-        ({"ftheta_p0": 0.0}, r"it has ftheta_p0: camera models of that kind are not supported"),
-        ({"latlong": True}, r"it has latlong: camera models of that kind are not supported"),
-        (
-            {"equirectangular": True},
-            r"it has equirectangular: camera models of that kind are not supported",
-        ),
-        ({"distortion_params": [0.1, 0.2]}, r"its distortion_params are not six numbers, k1, k2, k3, k4"),
+        ({"ftheta_p0": 0.0}, r"ftheta_p0.* not supported"),
+        ({"latlong": True}, r"latlong.* not supported"),
+        ({"equirectangular": True}, r"equirectangular.* not supported"),
+        ({"distortion_params": [0.1, 0.2]}, r"its distortion_params are not the six numbers k1, k2, k3, k4"),
         ({"distortion_params": [0.1, 0, 0, 0, 0, None]}, r"its p2 is None, not a finite number"),
-        ({"distortion_params": [0, 0, 0, 0.1, 0, 0]}, r"it has a k4, and its camera_model is not FULL_"),
-        ({"is_fisheye": True, "k5": 0.1}, r"it has a k5 or k6, and is a fisheye"),
-        ({"sx1": 0.1}, r"it has sx1 or sy1, and its camera_model is not THIN_PRISM_FISHEYE"),
+        ({"distortion_params": [0, 0, 0, 0.1, 0, 0]}, r"k4, .*FULL_OPENCV"),
+        ({"is_fisheye": True, "k5": 0.1}, r"a fisheye with k5 or k6"),
+        ({"sx1": 0.1}, r"sx1 or sy1, .*THIN_PRISM_FISHEYE"),
     ],
 )
 def test_what_is_no_camera_is_refused_by_name(read, changes: dict[str, Any], message: str) -> None:
@@ -406,7 +403,7 @@ def test_no_frame_with_a_photo_is_an_error(read) -> None:
 def test_a_photo_has_one_frame(read) -> None:
     for second in (frame(1, fl_x=51.0), frame(1, transform_matrix=matrix(2).tolist())):
         differs = "fl_x" if "fl_x" in second else "transform_matrix"
-        with refused("sfm.two-frames", "transforms.json", "ä1.png", "./1", f"differ in {differs}"):
+        with refused("sfm.two-frames", "transforms.json", "ä1.png", "./1", differs):
             read([frame(1), second], **LENS)
 
 

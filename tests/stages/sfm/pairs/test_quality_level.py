@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from stages import sfm
-from stages.contract import StageError
 from stages.io.photos import Photo
 from stages.sfm.pairs import quality_level
 from stages.sfm.pairs.pair_selection import CapturePriors
@@ -20,6 +19,7 @@ from stages.sfm.pairs.quality_level import (
     measure,
     quality_levels,
 )
+from tests.refusals import refused
 from tests.synthetic_photos import SyntheticPhotos
 
 ALL_OPEN = GivenOptions(None, None, None)
@@ -92,12 +92,9 @@ def test_what_is_given_stays_in_every_tier(progress, monkeypatch: pytest.MonkeyP
 def test_nothing_is_measured_without_a_time(progress, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quality_level, "COMMAND", ["-c", "raise SystemExit('measured')"])
     assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, None) == ChosenOptions(1600, 4096, "exhaustive")
-    with pytest.raises(StageError) as caught:
+    options = "--sfm.matcher exhaustive --sfm.max-image-size 1600 --sfm.max-features 4096"
+    with refused("sfm.not-measured", "measured", options):
         chosen(ALL_OPEN, photos(400), Path(), 30, progress, 60.0)
-    assert (caught.value.what, caught.value.why) == ("could not measure how long features and matches take", "measured")
-    assert caught.value.hint == (
-        "Say how, and nothing is measured: --sfm.matcher exhaustive --sfm.max-image-size 1600 --sfm.max-features 4096."
-    )
 
 
 def test_what_was_asked_for_stands(progress) -> None:
@@ -126,17 +123,15 @@ def test_features_and_pairs_take_time(synthetic_photos: SyntheticPhotos, indexed
 def test_spatial_matching_needs_gps_positions() -> None:
     check_matcher("spatial", CapturePriors(position_m=np.zeros((3, 3))))
     check_matcher("retrieval", CapturePriors())
-    with pytest.raises(StageError) as caught:
+    with refused("sfm.no-positions", "--sfm.matcher retrieval"):
         check_matcher("spatial", CapturePriors())
-    assert caught.value.what == "cannot select pairs of photos by GPS position"
-    assert caught.value.why == "not all photos have a GPS position in their EXIF data"
-    assert "--sfm.matcher retrieval" in caught.value.hint
 
 
 def test_with_time_given_ordinary_sets_reduce_too(progress, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = costing(monkeypatch, (0.5, 0.05), (0.2, 0.01))
     assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, 60.0) == ChosenOptions(1131, 2048, "exhaustive")
-    assert asked == list(QUALITY_LEVELS[:2]) and "with 4096 features a photo at 1600 pixels, about" in progress.notes[0]
+    assert asked == list(QUALITY_LEVELS[:2])
+    assert progress.names("sfm.quality-level", "4096 features a photo at 1600 pixels", "2048 features")
 
 
 def test_time_enough_is_found_by_measuring_or_beyond_doubt_without(progress, monkeypatch: pytest.MonkeyPatch) -> None:
