@@ -1,15 +1,16 @@
 """What a mesh looks like beside the photos: rasterised at the held-out cameras, scored where it covers them.
 
-    pipeline run PHOTOS --until evaluate
-    python -m benchmarks.mesh_looks PHOTOS.nerf --pictures /tmp/looks
+    pipeline run PHOTOS --until train
+    python -m benchmarks.mesh_looks PHOTOS.nerf --pictures /tmp/looks --field
 
-Texture, the same mesh with a colour per vertex, and today's default of 300,000 faces with a colour per vertex; beside
-them the field's own renders, as stage evaluate left them. All are shown as each photo is expected to be exposed (the
-photos taken nearest by tell), and scored on the same pixels. PSNR is of the mean squared error over these pixels, SSIM
-of the windows that hold nothing else; both are means over the photos.
+The textured mesh; the same mesh with a colour per vertex; the default mesh without a texture, of more faces; with
+--field the field itself (minutes per photo). All are shown as each photo is expected to be exposed (the photos taken
+nearest by tell), and scored on the pixels that all of them cover. PSNR is of the mean squared error over these pixels,
+SSIM of the windows that hold nothing else; both are means over the photos. Pictures: the photo, then these in order.
 """
 
 import argparse
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,20 +19,19 @@ import torch
 
 from benchmarks.record import Record, add_out
 from nerf.geometry.rays import Rays
-from nerf.geometry.scene import View
 from pipeline.engine.display import SilentDisplay
 from pipeline.engine.workspace import Workspace
 from stages.evaluate.image_metrics import ssim
 from stages.io.files import write_png
 from stages.io.pixels import load_pixels
-from stages.mesh import Config
+from stages.mesh import Config, plan
 from stages.mesh.extraction import Source, extract_mesh, load
 from stages.mesh.files import ColouredMesh
 from stages.mesh.rasteriser import barycentric, nearest_faces
 from stages.mesh.texture.photos import Photo, photo_of, projected, sampled_picture
-from stages.train.data import scaled_size, view_mask
+from stages.render.renderer import load_renderer
+from stages.train.data import scaled_size, view_mask, view_rays
 
-VERTEX_COLOUR_FACES = 300_000
 MAX_SHIFT = 8  # image sides, beyond which a vertex lies too far outside to be drawn
 
 
@@ -98,19 +98,23 @@ def looks(mesh: ColouredMesh, textured: bool, photo: Photo, width: int, height: 
 def scores(image: np.ndarray, truth: np.ndarray, used: np.ndarray) -> tuple[float, float | None]:
     """PSNR and SSIM of the pixels that are ``used``."""
     error = float(((image - truth)[used] ** 2).mean())
-    similarity = ssim(
-        *(torch.from_numpy(np.asarray(each, np.float32)) for each in (image, truth)), torch.from_numpy(used)
-    )
-    return -10 * np.log10(max(error, 1e-10)), similarity
+    shown, photo = (torch.from_numpy(np.asarray(each, np.float32)) for each in (image, truth))
+    similarity = ssim(shown, photo, torch.from_numpy(used))
+    return -10 * math.log10(max(error, 1e-10)), similarity
 
 
-def figures(source: Source, folders: dict[str, Path], config: Config, pictures: Path | None) -> dict[str, Any]:
+def meshes_of(source: Source, train: Path, resolution: int) -> dict[str, tuple[ColouredMesh, bool]]:
+    """The meshes compared, and whether to show their texture."""
+    made = []
+    for size in (Config().texture_size, 0):
+        config = plan(Config(resolution=resolution, texture_size=size), {"train": train}, SilentDisplay())
+        made.append(extract_mesh(config, source, SilentDisplay()).mesh)
+    return {"texture": (made[0], True), "vertex": (made[0], False), "untextured": (made[1], False)}
+
+
+def figures(source: Source, train: Path, given: argparse.Namespace, pictures: Path | None) -> dict[str, Any]:
     """The row of a workspace."""
-    textured = extract_mesh(config, source, SilentDisplay()).mesh
-    plain = extract_mesh(
-        config.model_copy(update={"texture_size": 0, "max_faces": VERTEX_COLOUR_FACES}), source, SilentDisplay()
-    ).mesh
-    kinds = {"texture": (textured, True), "vertex": (textured, False), "vertex_300k": (plain, False)}
+    kinds = meshes_of(source, train, given.resolution)
     found: dict[str, list[tuple[float, float | None]]] = {}
     shares = []
     for view in source.scene.of_split("test"):
@@ -118,26 +122,33 @@ def figures(source: Source, folders: dict[str, Path], config: Config, pictures: 
         width, height = scaled_size(photo.camera, None)
         truth = load_pixels(source.ingest / view.file, width, height)[..., :3] / np.float32(255)
         drawn = {kind: looks(mesh, has_texture, photo, width, height) for kind, (mesh, has_texture) in kinds.items()}
-        images = {kind: image for kind, (image, _) in drawn.items()} | field_render(folders["evaluate"], view)
         used = np.logical_and.reduce([covered for _, covered in drawn.values()])
         mask = view_mask(source.ingest, source.scene, view, None)
         used &= True if mask is None else mask.numpy()
+        images = {kind: image for kind, (image, _) in drawn.items()}
+        if given.field:
+            images["field"] = field_render(source, train, photo)
         shares.append(used.mean())
         for kind, image in images.items():
             found.setdefault(kind, []).append(scores(image, truth, used))
         if pictures:
-            strip = [truth, *images.values()]
-            write_png(pictures / f"{Path(view.file).stem}.png", (np.concatenate(strip, axis=1) * 255).astype(np.uint8))
-    row: dict[str, Any] = {"faces": len(textured.faces), "covered_percent": round(100 * float(np.mean(shares)), 1)}
+            strip = np.concatenate([truth, *images.values()], axis=1)
+            write_png(pictures / f"{Path(view.file).stem}.png", np.rint(strip * 255).astype(np.uint8))
+    row: dict[str, Any] = {
+        "faces": len(kinds["texture"][0].faces),
+        "untextured_faces": len(kinds["untextured"][0].faces),
+        "covered_percent": round(100 * float(np.mean(shares)), 1),
+    }
     for kind, pairs in found.items():
         row[f"{kind}_db"] = round(float(np.mean([psnr for psnr, _ in pairs])), 2)
         row[f"{kind}_ssim"] = round(float(np.mean([value for _, value in pairs if value is not None])), 3)
     return row
 
 
-def field_render(evaluate: Path, view: View) -> dict[str, np.ndarray]:
-    """The field's render of a test photo."""
-    return {}
+def field_render(source: Source, train: Path, photo: Photo) -> np.ndarray:
+    """What the field shows of a test photo, (height, width, 3)."""
+    renderer = load_renderer(train).through(photo.effects)
+    return renderer.render(view_rays(source.scene, photo.view, None)).colour.clamp(0, 1).numpy()
 
 
 def main() -> None:
@@ -145,6 +156,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workspaces", type=Path, nargs="+")
     parser.add_argument("--resolution", type=int, default=192)
+    parser.add_argument("--field", action="store_true", help="render the field as well")
     parser.add_argument("--pictures", type=Path, help="folder for pictures of every held-out photo")
     add_out(parser)
     given = parser.parse_args()
@@ -152,11 +164,10 @@ def main() -> None:
     for path in given.workspaces:
         workspace = Workspace.existing(path)
         keys = workspace.read_run().keys
-        folders = {
-            stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train", "evaluate")
-        }
+        folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train")}
         source = load(folders, SilentDisplay())
-        record.add(set=path.stem, **figures(source, folders, Config(resolution=given.resolution), given.pictures))
+        pictures = None if given.pictures is None else given.pictures / path.stem
+        record.add(set=path.stem, **figures(source, folders["train"], given, pictures))
 
 
 if __name__ == "__main__":
