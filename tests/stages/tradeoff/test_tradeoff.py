@@ -12,10 +12,9 @@ import torch
 from PIL import Image
 
 from nerf.geometry.scene import Camera
-from stages import evaluate, tradeoff, train
+from stages import tradeoff, train
 from stages.contract import StageError, run_stage
 from stages.effects.decisions import Decisions, write_decisions
-from stages.evaluate import tiles
 from stages.evaluate.tiles import MIN_TILES
 from stages.io import stopwatch
 from stages.io.files import read_json, read_scene, write_json
@@ -356,20 +355,6 @@ def test_tiles_are_parts_of_all_test_photos(photos: dict[str, Path]) -> None:
             rows, columns = slice(16 * number, 16 * number + 16), slice(left, left + 16)
             assert torch.equal(crop.truth[rows], truth[:, columns])
             assert torch.equal(crop.rays.directions[rows], rays.directions[:, columns])
-
-
-def test_a_study_scores_as_evaluate_does(
-    tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tiles, "TILE_SIZE", 8)  # six cover a photo of 24 × 16 without overlap
-    own, scored = tmp_path / "train", tmp_path / "evaluate"
-    for folder in (own, scored):
-        folder.mkdir()
-    run_stage(train, train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, own, progress)
-    facts = run_stage(evaluate, evaluate.Config(fraction=1), photos | {"train": own}, scored, progress).facts
-    made = benchmark.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), None, 1000, 2.0)
-    figures = benchmark.score(own, made, progress)
-    assert figures["psnr"] == pytest.approx(facts["psnr"], abs=0.001)
 
 
 def test_large_photos_among_small_ones_are_drawn_small_and_whole(

@@ -1,5 +1,4 @@
 import weakref
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -143,24 +142,6 @@ def test_pixel_store_is_asked_once_a_split(tmp_path: Path, monkeypatch: pytest.M
     for view in scene.views:
         reader.pixels(view, WHITE)
     assert sorted(asked) == ["test", "train"]
-
-
-@pytest.mark.parametrize("downscale", [1.0, 8.0])
-@pytest.mark.parametrize("has_alpha", [True, False])  # of the scene: where it has none, that of photos is dropped
-def test_parallel_decoding_follows_the_files_sizes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, progress: SilentProgress, has_alpha: bool, downscale: float
-) -> None:
-    def pool(workers: int) -> ThreadPoolExecutor:
-        asked.append(workers)
-        return ThreadPoolExecutor(workers)
-
-    asked = list[int]()
-    inputs, scene = photographed(tmp_path, channels=4)
-    monkeypatch.setattr("stages.io.pixels.processors", lambda: 16)
-    monkeypatch.setattr("stages.io.pixels.DECODING_BYTES", 2 * 80 * WIDTH * HEIGHT)
-    monkeypatch.setattr("stages.io.pixel_store.ThreadPoolExecutor", pool)
-    training_dataset(inputs["ingest"], replace(scene, has_alpha=has_alpha), "train", downscale, progress)
-    assert asked == [2]
 
 
 LENSES = {

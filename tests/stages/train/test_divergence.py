@@ -48,9 +48,6 @@ def short_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop, "MIN_HEALTHY_STEPS", WARM_UP)
     monkeypatch.setattr("stages.train.training.write_profile", lambda *_: [])
     monkeypatch.setattr("stages.train.validation_images.EVALUATION_PIXELS", 256)
-    monkeypatch.setattr(
-        "nerf.fields.occupancy_grid.UPDATE_INTERVAL", 32
-    )  # measuring it is most of what so small a field costs
 
 
 @pytest.fixture
