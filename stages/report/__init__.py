@@ -14,7 +14,7 @@ from stages.contract import READING_SECONDS, Inputs, Progress, StageConfig, Stag
 from stages.io.files import write_json
 
 INPUTS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "tradeoff")
-VERSION = 11
+VERSION = 12
 EXIT_CODE = 18
 RESUMES = False
 SUMMARY = True
