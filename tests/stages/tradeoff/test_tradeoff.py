@@ -184,7 +184,7 @@ def test_a_slow_machine_leaves_arms_out_and_names_them(
     assert len(content["left_out"]) > len(
         study.schedule_of(Config.model_validate(CONFIG | {"speeds": SPEEDS})).left_out
     )
-    assert any("slower than when it was measured" in note for note in progress.notes)
+    assert progress.names("tradeoff.not-trained", "slower")
 
 
 def test_what_a_killed_attempt_took_is_time_of_the_study(
@@ -195,10 +195,9 @@ def test_what_a_killed_attempt_took_is_time_of_the_study(
         studied(tmp_path, photos, progress)
     studied(tmp_path, photos, progress)
     assert 0.9 * CONFIG["seconds"] < now[0] - 100 <= 1.1 * CONFIG["seconds"]
-    first, again = (note for note in progress.notes if "runs" in note and "until" in note)
+    first, again = (note for note in progress.said("tradeoff.schedule") if "until" in note)
     assert " runs: about " in first and " runs, 3 of them done: about " in again
-    assert any(note.startswith("no time is left; not trained: ") for note in progress.notes)
-    assert not any("slower" in note for note in progress.notes), "the kill took the time"
+    assert progress.names("tradeoff.not-trained", "no time"), "the kill took the time"
 
 
 def test_a_study_out_of_time_still_has_a_result(
@@ -296,7 +295,7 @@ def test_a_run_that_does_not_learn_is_told(
     assert f" 1 of {len(content['runs'])} runs without a result · " in result.line
     assert "no positional encoding" not in {row["variant"] for row in content["points"]}
     assert [a["failed"] for a in content["runs"] if a["failed"]] == ["training diverged: it was told to"]
-    assert any("no result (training diverged: it was told to)" in note for note in progress.notes)
+    assert progress.names("tradeoff.result", "training diverged: it was told to")
 
 
 def test_lack_of_memory_ends_and_resumes_the_study(

@@ -189,7 +189,7 @@ def test_a_reduced_pixel_is_used_where_all_it_covers_is(
     assert torch.equal(used, (torch.arange(width) < columns).expand(height, width))
     dataset = training_dataset(inputs["ingest"], scene, "train", downscale, progress)
     assert (dataset.unmasked_count, len(dataset.pixels)) == (6 * height * columns, 6 * height * width)
-    assert progress.notes[-1] == f"masks leave {columns / width:.0%} of the pixels of the train photos"
+    assert progress.codes[-1] == "train.masked" and progress.names("train.masked", f"{columns / width:.0%}", "training")
 
 
 def test_masks_are_loaded_a_few_at_a_time_and_dropped(
