@@ -30,7 +30,8 @@ def study(photos: Path, root: Path, seconds: float) -> Path:
     settings = with_source(Settings(tradeoff=Config(seconds=seconds)), photos, None)
     with Workspace(root) as workspace:
         runner = Runner(workspace, settings, PlainDisplay())
-        runner.run([*needed_for("train"), "tradeoff"])  # so that the field of a default run is among the points
+        trained = needed_for("train", runner.options)  # so that the field of a default run is among the points
+        runner.run([*trained, "tradeoff"])
         return workspace.folder("tradeoff", runner.done["tradeoff"].key)
 
 

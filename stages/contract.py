@@ -15,6 +15,8 @@ and may have (:data:`DEFAULTS` hold otherwise)
 
 * ``OPTIONAL_INPUTS: tuple[str, ...]``: stages whose finished folders it reads where they are there: they are no part of
   its key and are not brought up to date for it, nor given to it where damaged, so no output may depend on them;
+* ``more_inputs(config) -> tuple[str, ...]``: the stages that it reads beside its ``INPUTS`` because its options ask for
+  it (:func:`inputs_of`);
 * ``NOT_HASHED: tuple[str, ...]``: options that cannot change the result and so do not enter the key;
 * ``plan(config, inputs, progress) -> Config``: replaces every ``None`` ("choose for me") by a value, where it must by
   timing a piece of the work. :func:`plan_stage` calls it, once, before the stage's first run; the answer is kept in
@@ -236,12 +238,17 @@ def _unknown(config: StageConfig, workload: Workload) -> float | None:
     return None
 
 
+def _nothing_more(config: StageConfig) -> tuple[str, ...]:
+    return ()
+
+
 def _unlimited(options: Mapping[str, Any]) -> float | None:
     return None
 
 
 DEFAULTS: dict[str, Any] = {
     "OPTIONAL_INPUTS": (),
+    "more_inputs": _nothing_more,
     "NOT_HASHED": (),
     "plan": None,
     "ON_REQUEST": False,
@@ -256,3 +263,8 @@ DEFAULTS: dict[str, Any] = {
 def declared(stage: ModuleType, name: str) -> Any:
     """What a stage declares under ``name``, or the default."""
     return getattr(stage, name, DEFAULTS[name])
+
+
+def inputs_of(stage: ModuleType, config: StageConfig) -> tuple[str, ...]:
+    """The stages whose finished folders a stage reads under these options."""
+    return (*stage.INPUTS, *declared(stage, "more_inputs")(config))

@@ -58,9 +58,9 @@ class HashGridTrainerSettings:
     of a step, each computed on a core; results depend on their number, not on that of the cores. ``background``: the
     colour behind a scene without a background model, or another random one for each ray (only for photos with alpha,
     where it shows the field which space is empty). ``distortion_weight``: full weight of the distortion loss, for
-    scenes without a known background. ``depth_weight``: initial weight of the sparse depth loss. ``min_photos``: how
-    many photos must see a cell of unbounded space before their foregrounds for it to hold density
-    (nerf/fields/frustum_mask.py), or all but one where they are few.
+    scenes without a known background. ``depth_weight``: initial weight of the depth loss, at sparse points and where
+    depth maps know the distance. ``min_photos``: how many photos must see a cell of unbounded space before their
+    foregrounds for it to hold density (nerf/fields/frustum_mask.py), or all but one where they are few.
     """
 
     seed: int
@@ -76,7 +76,7 @@ class HashGridTrainerSettings:
 class HashGridBatch(NamedTuple):
     """Rays with their target colours, which are composited over ``background``. ``jitter`` places the samples in their
     intervals, ``thinning_offset`` decides which thin samples are kept (both in [0, 1)). ``view`` is the image of a ray,
-    ``sparse_depth`` the distance of the sparse point on it; 0: there is none."""
+    ``known_depth`` the distance of what it meets, by a sparse point or a depth map; 0: that is not known."""
 
     rays: Rays
     target: Float[Tensor, "rays 3"]
@@ -84,7 +84,7 @@ class HashGridBatch(NamedTuple):
     jitter: Float[Tensor, "rays"]
     thinning_offset: Float[Tensor, "rays"]
     view: Int[Tensor, "rays"]
-    sparse_depth: Float[Tensor, "rays"]
+    known_depth: Float[Tensor, "rays"]
 
 
 class Loss(NamedTuple):
@@ -127,7 +127,7 @@ def distortion_multiplier(progress: float) -> float:
 
 
 def depth_loss_multiplier(progress: float) -> float:
-    """The weight of the sparse depth loss over its initial one: it falls to zero over the run. Geometry is decided
+    """The weight of the depth loss over its initial one: it falls to zero over the run. Geometry is decided
     early, and once it is about right the photos constrain it better than the points do."""
     return 1 - progress
 
@@ -219,27 +219,46 @@ class HashGridTrainer:
         # Counted over the whole step: a micro-batch alone may be too small for a single ray to a sparse point.
         first, end = (self._photo_ray_count(number * count, progress) for number in (index, index + 1))
         pixel = self.dataset.unmasked_pixels(self.pixel_sampler.take(int(self.pixels_sampled) + first, end - first))
-        sparse_count, sparse_depth = count - len(pixel), torch.zeros(count, device=device)
+        sparse_count, known_depth = count - len(pixel), torch.zeros(count, device=device)
         if sparse_count:
-            sparse_pixels, sparse_depth[-sparse_count:] = self.dataset.sample_sparse_depths(sparse_count, random)
+            sparse_pixels, known_depth[-sparse_count:] = self.dataset.sample_sparse_depths(sparse_count, random)
             pixel = torch.cat([pixel, sparse_pixels])
         rays, colour, alpha, view = self.dataset.lookup(pixel)
+        if self.dataset.depth_maps is not None and self._has_depth_loss(progress):
+            of_maps = self._map_depths(pixel, rays, alpha, view)
+            known_depth = torch.where(known_depth > 0, known_depth, of_maps)
         if self.settings.background == "random":
             background = torch.rand(count, 3, generator=random, device=device)
         else:
             background = self.fixed_background.repeat(count, 1)
         target = colour if alpha is None else torch.lerp(background, colour, alpha[:, None])
         jitter, thinning_offset = torch.rand(2, count, generator=random, device=device)
-        return HashGridBatch(rays, target, background, jitter, thinning_offset, view, sparse_depth)
+        return HashGridBatch(rays, target, background, jitter, thinning_offset, view, known_depth)
+
+    def _map_depths(
+        self,
+        pixel: Int[Tensor, "rays"],
+        rays: Rays,
+        alpha: Float[Tensor, "rays"] | None,
+        view: Int[Tensor, "rays"],
+    ) -> Float[Tensor, "rays"]:
+        """Distances by the depth maps; 0 where pixels are transparent, or what they show lies outside a bounded scene's
+        box, where nothing is rendered."""
+        distance = self.dataset.depths(pixel, view)
+        if alpha is not None:
+            distance = distance * (alpha == 1)
+        if not self.model.space.unbounded:
+            distance = distance * ((rays.origins + distance[:, None] * rays.directions).abs() <= BOX).all(-1)
+        return distance
 
     def _photo_ray_count(self, rays: int, progress: float) -> int:
         """How many of so many rays go through pixels of the sampler; the others go to sparse points."""
-        return rays - rays // DEPTH_RAY_INTERVAL if self._has_depth_loss(progress) else rays
+        to_points = self.dataset.sparse_pixels is not None and self._has_depth_loss(progress)
+        return rays - rays // DEPTH_RAY_INTERVAL if to_points else rays
 
     def _has_depth_loss(self, progress: float) -> bool:
-        return (
-            self.dataset.sparse_pixels is not None and self.settings.depth_weight * depth_loss_multiplier(progress) > 0
-        )
+        known = self.dataset.sparse_pixels is not None or self.dataset.depth_maps is not None
+        return known and self.settings.depth_weight * depth_loss_multiplier(progress) > 0
 
     def _compute_micro_batch(self, step: int, progress: float, rays: int, index: int) -> _MicroBatch:
         """What micro-batch number ``index``, of so many rays, adds to loss and gradients."""
@@ -288,14 +307,14 @@ class HashGridTrainer:
         mapped, samples = forward_pass.mapped, forward_pass.samples
         if self.settings.distortion_weight:
             per_ray = self.settings.distortion_weight * distortion_multiplier(progress) / rays
-            each = torch.full_like(batch.sparse_depth, per_ray)
+            each = torch.full_like(batch.known_depth, per_ray)
             marched = samples._replace(dt=samples.dt / mapped.scene_length(samples.t, samples.ray))
             value = value + (each * backend.distortion(marched, forward_pass.weights, stepping)).sum()
             grad_weights = backend.distortion_backward(marched, forward_pass.weights, stepping, each)
         if self._has_depth_loss(progress):
             per_ray = self.settings.depth_weight * depth_loss_multiplier(progress) / rays
-            each = torch.full_like(batch.sparse_depth, per_ray)
-            arguments = mapped.rays.far, mapped.from_scene(batch.sparse_depth), stepping
+            each = torch.full_like(batch.known_depth, per_ray)
+            arguments = mapped.rays.far, mapped.from_scene(batch.known_depth), stepping
             depth_loss = backend.depth_loss(samples, forward_pass.weights, forward_pass.rendering.opacity, *arguments)
             value = value + (each * depth_loss).sum()
             more_weights, more_opacity = backend.depth_loss_backward(samples, *arguments, each)

@@ -34,6 +34,18 @@ class PixelBatch(NamedTuple):
     view: Int[Tensor, "rays"]
 
 
+class DepthMaps(NamedTuple):
+    """Depth maps of all views, laid end to end row by row, of any sizes: ``distance`` along the unit rays of their
+    pixels (scene units; 0: not known). ``layout`` has a column per view: its first entry, width, height."""
+
+    distance: Float[Tensor, "entries"]
+    layout: Int[Tensor, "3 views"]
+
+    def to(self, device: torch.device | str) -> "DepthMaps":
+        """These, on ``device``."""
+        return DepthMaps(*(table.to(device) for table in self))
+
+
 class RayDataset(NamedTuple):
     """Photos as one table of pixels; make it with :func:`make_ray_dataset` or :func:`ray_dataset_from_images`.
 
@@ -50,7 +62,7 @@ class RayDataset(NamedTuple):
     last column has the number of all of them. None: no pixel is masked.
 
     ``sparse_pixels`` are pixels that show a sparse point, ``sparse_depths`` how far along their rays (scene units) it
-    lies. None: of no pixel is that known.
+    lies. None: of no pixel is that known. ``depth_maps``: what stereo says of every pixel; None: nothing.
     """
 
     pixels: UInt8[Tensor, "pixels channels"]
@@ -61,6 +73,7 @@ class RayDataset(NamedTuple):
     runs: Int[Tensor, "2 runs_and_end"] | None = None
     sparse_pixels: Int[Tensor, "known"] | None = None
     sparse_depths: Float[Tensor, "known"] | None = None
+    depth_maps: DepthMaps | None = None
 
     @property
     def device(self) -> torch.device:
@@ -131,6 +144,29 @@ class RayDataset(NamedTuple):
         return self._replace(
             sparse_pixels=pixel if sparse_pixels else None, sparse_depths=sparse_depths if sparse_pixels else None
         )
+
+    def with_depth_maps(self, distances: Sequence[Float[Tensor, "_ _"]]) -> "RayDataset":
+        """This dataset with a depth map per view, of any size: distances along the rays (scene units), 0 where they are
+        not known. Raises ValueError unless there is one for each view."""
+        if len(distances) != len(self.near):
+            raise ValueError(f"there are {len(distances)} depth maps, and {len(self.near)} photos")
+        first = _starts([each.numel() for each in distances])[:-1]
+        sizes = torch.tensor([(each.shape[1], each.shape[0]) for each in distances])
+        maps = DepthMaps(torch.cat([each.flatten() for each in distances]), torch.cat([first[:, None], sizes], 1).T)
+        return self._replace(depth_maps=maps.to(self.device))
+
+    def depths(self, pixel: Int[Tensor, "rays"], view: Int[Tensor, "rays"]) -> Float[Tensor, "rays"]:
+        """How far along their rays pixels of these views show something, by the pixel of their depth map that their
+        middle falls into; 0 where that is not known, and beyond near and far."""
+        assert self.depth_maps is not None, "the dataset has no depth maps"
+        first_pixel, width, *_ = self.view_layout.index_select(1, view)
+        height = self.first_pixel.diff().index_select(0, view) // width
+        first, across, down = self.depth_maps.layout.index_select(1, view)
+        within = pixel - first_pixel
+        row, column = (2 * (within // width) + 1) * down // (2 * height), (2 * (within % width) + 1) * across
+        distance = self.depth_maps.distance.index_select(0, first + row * across + column // (2 * width))
+        near, far = self.view_geometry[12:14].index_select(1, view)
+        return distance * ((near < distance) & (distance < far))
 
     def lookup(self, pixel: Int[Tensor, "rays"]) -> PixelBatch:
         """Given pixels, and the rays through them."""

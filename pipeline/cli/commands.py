@@ -147,7 +147,7 @@ def command_run(words: Sequence[str]) -> int:
         cameras = cameras or recorded.ingest.cameras
     asked = _matching_exposure(with_effects(_more(settings, given.more, root), given.effect), given.match_exposure)
     asked = _keeping_studies(asked, root, words, file)
-    stages = stage_list.up_to(_known_stage(given.until or list(stage_list.STAGES)[-1], "--until"))
+    stages = stage_list.up_to(_known_stage(given.until or list(stage_list.STAGES)[-1], "--until"), dict(asked))
     force = frozenset[str]()
     if given.from_ is not None:
         force = frozenset(stages[stages.index(_known_stage(given.from_, "--from", stages)) :])
@@ -155,6 +155,8 @@ def command_run(words: Sequence[str]) -> int:
     if budget is not None and (studies := [stage for stage in stages if stage_list.is_on_request(stage)]):
         stage = studies[0]
         what = f"no budget covers {stage}, which has its own time limit (--{stage}.seconds)"
+        if stage != given.until:
+            raise UsageError(f"--budget and --train.depth: {what}; give --train.seconds in place of --budget")
         raise UsageError(f"--budget and --until {stage}: {what}; run first, then `pipeline {stage} {root}`")
     with choose_display(given.common.json) as display:
         try:
@@ -276,7 +278,7 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
     if given.cameras is not None:
         update = {"cameras": given.cameras.absolute()}
         settings = settings.model_copy(update={"render": settings.render.model_copy(update=update)})
-    stages = stage_list.needed_for(stage)
+    stages = stage_list.needed_for(stage, dict(settings))
     shown = [name for name in workspace.read_run().keys if stage_list.is_summary(name) and name not in stages]
     stages = [*stages, *shown]
     with choose_display(given.common.json) as display:
@@ -379,7 +381,8 @@ def command_demo(words: Sequence[str]) -> int:
         display.end("photos", line, seconds, cached=seconds == 0)
         settings = with_source(asked, photos, None)
         budgeted = (budget, seconds)
-        code = _run_stages(root, settings, stage_list.usual(), given.common, display, new_budget=budgeted)
+        stages = stage_list.up_to(list(stage_list.STAGES)[-1], dict(settings))
+        code = _run_stages(root, settings, stages, given.common, display, new_budget=budgeted)
         started = time.monotonic()
         display.begin("truth")
         *notes, last = demo.truth_lines(root / "output", photos)

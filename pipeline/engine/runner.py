@@ -27,7 +27,7 @@ from pipeline.schedule.forecast import (
     photos_of,
     time_behind_plan,
 )
-from stages.contract import StageConfig, StageError, Workload, declared, plan_stage, reading_seconds
+from stages.contract import StageConfig, StageError, Workload, declared, inputs_of, plan_stage, reading_seconds
 from stages.hardware.device import processors
 from stages.ingest.sources import find_source, is_gone
 from stages.io.photos import read_photos
@@ -67,6 +67,10 @@ class Runner:
     def options(self) -> dict[str, Any]:
         """The options of each stage, as the user gave them."""
         return {stage: getattr(self.settings, stage) for stage in STAGES}
+
+    def _inputs(self, stage: str) -> tuple[str, ...]:
+        """The stages that ``stage`` reads under the options of this run."""
+        return inputs_of(STAGES[stage], self.options[stage])
 
     def set_budget(self, total: float | None, before: float) -> None:
         """Make ``total`` seconds the budget of this workspace, None for no limit. The same as before goes on.
@@ -184,7 +188,7 @@ class Runner:
     def _unlink_after(self, stage: str) -> None:
         """Take out of ``output/`` what rests on ``stage``, which was running; nothing where none was."""
         for later, module in STAGES.items():
-            if stage and (is_summary(later, STAGES) or stage in needed_for(later, STAGES)):
+            if stage and (is_summary(later, STAGES) or stage in needed_for(later, self.options, STAGES)):
                 self.workspace.unlink_outputs(module.PUBLISHED)
 
     def _bring_up_to_date(self, stage: str) -> bool:
@@ -226,7 +230,7 @@ class Runner:
         damaged = False
         for name in [name for name in folders if name not in self.checked]:
             self.display.update(f"checking the files of {name}")
-            needed = name in STAGES[stage].INPUTS
+            needed = name in self._inputs(stage)
             try:
                 if needed:
                     self.workspace.finished(name, self.done[name].key, deep=True)
@@ -247,7 +251,8 @@ class Runner:
 
     def _rebuild_inputs(self, stage: str) -> None:
         """Bring everything below ``stage`` up to date once more; what lies above the damage may change with it."""
-        needed = {name for above in STAGES[stage].INPUTS if above in self.done for name in needed_for(above, STAGES)}
+        above = [name for name in self._inputs(stage) if name in self.done]
+        needed = {name for one in above for name in needed_for(one, self.options, STAGES)}
         clock = time.monotonic()
         self.done.clear()
         self.photos = None  # perhaps hours after they were listed
@@ -263,7 +268,8 @@ class Runner:
         Raises NotReady where an upstream result is missing, or where settings are left open and may not be planned.
         """
         module, summary = STAGES[stage], is_summary(stage, STAGES)
-        upstream = {name: m for name in module.INPUTS if (m := self._upstream(name, needed=not summary)) is not None}
+        read = self._inputs(stage)
+        upstream = {name: m for name in read if (m := self._upstream(name, needed=not summary)) is not None}
         names = declared(module, "OPTIONAL_INPUTS")
         optional = {name: m for name in names if (m := self._upstream(name, needed=False)) is not None}
         folders = {name: self.workspace.folder(name, m.key) for name, m in (upstream | optional).items()}
@@ -287,7 +293,7 @@ class Runner:
                 if needed:
                     raise NotReady(name) from None
             except StageError:  # a file that a setting names is gone: the stage says so where it runs
-                rests_on_it = (name in m.INPUTS for later, m in STAGES.items() if not is_summary(later, STAGES))
+                rests_on_it = (name in self._inputs(later) for later in STAGES if not is_summary(later, STAGES))
                 if needed or any(rests_on_it):
                     raise
         return self.done.get(name)

@@ -5,7 +5,7 @@ from pathlib import Path
 from types import ModuleType
 
 from stages import depth, effects, evaluate, ingest, mesh, normalise, render, report, sfm, tradeoff, train
-from stages.contract import declared
+from stages.contract import StageConfig, declared, inputs_of
 
 STAGES: dict[str, ModuleType] = {
     module.__name__.rpartition(".")[2]: module
@@ -26,21 +26,25 @@ def is_on_request(stage: str) -> bool:
     return declared(STAGES[stage], "ON_REQUEST")
 
 
-def needed_for(stage: str, stages: Mapping[str, ModuleType] = STAGES) -> list[str]:
-    """``stage`` and everything it depends on, in order; a summary is written from whatever is there."""
+def needed_for(stage: str, options: Mapping[str, StageConfig], stages: Mapping[str, ModuleType] = STAGES) -> list[str]:
+    """``stage`` and everything it depends on under these ``options`` of each stage, in order; a summary is written from
+    whatever is there."""
     if is_summary(stage, stages):
         return [stage]
     wanted = {stage}
     for name in reversed(list(stages)):
         if name in wanted:
-            wanted.update(stages[name].INPUTS)
+            wanted.update(inputs_of(stages[name], options[name]))
     return [name for name in stages if name in wanted]
 
 
-def up_to(stage: str) -> list[str]:
-    """All stages from the first to ``stage``, in order, of those on request only ``stage`` itself."""
+def up_to(stage: str, options: Mapping[str, StageConfig] | None = None) -> list[str]:
+    """All stages from the first to ``stage``, in order; of those on request only ``stage`` itself and what the others
+    read by their ``options``."""
     names = list(STAGES)
-    return [name for name in names[: names.index(stage) + 1] if name == stage or not is_on_request(name)]
+    asked = [name for name in names[: names.index(stage) + 1] if name == stage or not is_on_request(name)]
+    read = {one for name in asked if options for one in declared(STAGES[name], "more_inputs")(options[name])}
+    return [name for name in names if name in asked or name in read]
 
 
 def usual() -> list[str]:

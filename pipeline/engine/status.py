@@ -11,7 +11,7 @@ from pipeline.engine.manifests import BadManifest, Manifest
 from pipeline.engine.runner import Runner
 from pipeline.engine.stage_list import STAGES, command_that_makes
 from pipeline.engine.workspace import Workspace
-from stages.contract import KEY_LENGTH, Options, StageError, declared
+from stages.contract import KEY_LENGTH, Options, StageError, declared, inputs_of
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
 
 def _why_unplanned(runner: Runner, stage: str, last: Manifest) -> str:
     """Why a stage whose inputs are there has not the result it needs, while its open options are not chosen yet."""
-    inputs = {name: runner.done[name].outputs_digest for name in STAGES[stage].INPUTS}
+    inputs = {name: runner.done[name].outputs_digest for name in inputs_of(STAGES[stage], runner.options[stage])}
     return "; ".join(_other_inputs(inputs, last)) or "its automatic options are chosen again"
 
 

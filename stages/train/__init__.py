@@ -46,6 +46,11 @@ def trained_seconds(workload: Workload) -> float | None:
     return before["train_seconds"] + config.more_seconds if before and config.more_seconds else None
 
 
+def more_inputs(config: Config) -> tuple[str, ...]:
+    """Depth maps, where training is to use them."""
+    return ("depth",) if config.depth else ()
+
+
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Field, budget and sizes, where they were left open, by the scene and the speed of this machine."""
     from stages.train.planning import planned

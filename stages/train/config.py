@@ -65,6 +65,9 @@ class Config(StageConfig):
         default=None, gt=0, description="Initial learning rate (default: from the field)."
     )
     seed: int = Field(default=0, description="Seed of weights, batches and samples.")
+    depth: bool = Field(
+        default=False, description="Supervise the hash-grid field by the depth maps of stage depth, which runs first."
+    )
     downscale: Auto[float] = Field(
         default=None, ge=1, description="Photo width divided by trained width (default: as the budget allows)."
     )
@@ -137,6 +140,8 @@ class Config(StageConfig):
             flags[self.field] = f"--train.field {self.field}"
         if (field := PRESET_FIELDS.get(self.preset or "")) is not None:
             flags.setdefault(field, f"--train.preset {self.preset}")
+        if self.depth:
+            flags.setdefault("grid", "--train.depth")
         for field in FIELD_NAMES:
             options: Options = getattr(self, field)
             for name, option in type(options).model_fields.items():

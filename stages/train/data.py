@@ -14,6 +14,7 @@ from nerf.geometry.rays import Rays, rays_of_view
 from nerf.training.ray_dataset import PosedViews, RayDataset, make_ray_dataset
 from nerf.training.trainer import composite_over
 from stages.contract import Inputs, Progress, StageError
+from stages.depth.files import depth_map_file, read_depth_map
 from stages.effects.track_colours import training_tracks
 from stages.io.files import read_tensors
 from stages.io.pixel_store import PixelStore, StoredPhoto, fill, pixel_store
@@ -95,8 +96,11 @@ def training_dataset(
     return _masked(dataset, masks, split, progress)
 
 
-def guided_dataset(inputs: Inputs, scene: "Scene", downscale: float, progress: Progress) -> RayDataset:
-    """:func:`training_dataset` of the training photos, which knows how far away are the sparse points that they show.
+def guided_dataset(
+    inputs: Inputs, scene: "Scene", downscale: float, progress: Progress, depth: Path | None = None
+) -> RayDataset:
+    """:func:`training_dataset` of the training photos, which knows how far away are the sparse points that they show;
+    and their depth maps, where the folder of stage ``depth`` is given.
 
     Of normalise's points only those that two training photos saw at least, where these saw them."""
     dataset = training_dataset(inputs["ingest"], scene, "train", downscale, progress)
@@ -107,9 +111,13 @@ def guided_dataset(inputs: Inputs, scene: "Scene", downscale: float, progress: P
     size = np.array([scaled_size(camera, downscale) for camera in cameras]).reshape(-1, 2)[tracks.view]
     column, row = np.clip(np.floor(xy * size / full), 0, size - 1).astype(int).T
     within = torch.from_numpy(row * size[:, 0] + column)
-    return dataset.with_sparse_depths(
+    dataset = dataset.with_sparse_depths(
         dataset.first_pixel[torch.from_numpy(tracks.view)] + within, torch.from_numpy(tracks.distance)
     )
+    if depth is None:
+        return dataset
+    files = [depth_map_file(depth, view.file) for view in scene.of_split("train")]
+    return dataset.with_depth_maps([torch.from_numpy(read_depth_map(file).distance) for file in files])
 
 
 def _ignored(

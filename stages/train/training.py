@@ -82,7 +82,11 @@ def prepare(config: Config, scene: Scene, inputs: Inputs, folder: Path, progress
         field = field_of(config)
         check_memory(field.memory_bytes(config, cores()), "the field", *field.memory_advice(config))
     progress.update("reading the photos")
-    dataset = guided_dataset(inputs, scene, config.downscale, progress).to(device)
+    depth = inputs["depth"] if config.depth else None
+    dataset = guided_dataset(inputs, scene, config.downscale, progress, depth).to(device)
+    if dataset.depth_maps is not None:
+        known = float((dataset.depth_maps.distance > 0).float().mean())
+        progress.note("train.depth-maps", f"depth maps know the distance of {known:.0%} of the pixels")
     background = torch.tensor(field_background(config, scene), device=device)
 
     evaluation_sets = EvaluationSets(

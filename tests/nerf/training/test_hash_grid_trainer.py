@@ -101,7 +101,7 @@ def test_a_batchs_gradient_is_the_sum_over_chunks() -> None:
     run.dataset = run.dataset.with_sparse_depths(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
     rays = run._rays_per_micro_batch()
     parts = [run._compute_micro_batch(0, 0.25, rays, chunk) for chunk in range(4)]
-    assert sum(int((part.batch.sparse_depth > 0).sum()) for part in parts) == 4 * rays // 8
+    assert sum(int((part.batch.known_depth > 0).sum()) for part in parts) == 4 * rays // 8
     assert rays > 10 and not torch.equal(parts[0].batch.target, parts[1].batch.target)
     whole = HashGridBatch(
         Rays(*(torch.cat(part) for part in zip(*(part.batch.rays for part in parts), strict=True))),
@@ -173,7 +173,7 @@ def test_a_non_finite_step_changes_nothing_and_shows_its_batch(
         "jitter",
         "thinning_offset",
         "view",
-        "sparse_depth",
+        "known_depth",
     }
 
 
@@ -386,8 +386,31 @@ def test_an_eighth_of_the_rays_run_to_points() -> None:
     run = trainer(replace(TRAINER, depth_weight=0.1))
     run.dataset = run.dataset.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
     for count in (1, 3, 5, 8, 21):
-        to_points = [int((run._batch(0, 0.1, chunk, count).sparse_depth > 0).sum()) for chunk in range(32)]
+        to_points = [int((run._batch(0, 0.1, chunk, count).known_depth > 0).sum()) for chunk in range(32)]
         assert sum(to_points) == 32 * count // 8 and max(to_points) - min(to_points) <= 1
+
+
+def test_depth_maps_supervise_opaque_pixels_in_the_box() -> None:
+    run = trainer(replace(TRAINER, depth_weight=0.1))
+    run.dataset = run.dataset.with_depth_maps([torch.full((3, 3), 2.5), torch.full((12, 12), 4.9)])
+    batch = run._batch(0, 0.1, 0, 288)
+    _, _, alpha, view = run.dataset.lookup(run.dataset.unmasked_pixels(run.pixel_sampler.take(0, 288)))
+    assert alpha is not None and 0 < (alpha == 1).float().mean() < 1
+    assert torch.equal(batch.known_depth, torch.where((alpha == 1) & (view == 0), 2.5, 0.0)), "4.9 ends behind the box"
+    assert not run._batch(0, 1.0, 0, 288).known_depth.any(), "at the end photos alone decide"
+
+
+def test_depth_maps_pull_density_to_where_they_are() -> None:
+    at = []
+    for distance in (2.4, 3.4):
+        run = trainer(replace(TRAINER, depth_weight=1.0, background=BACKGROUND))
+        run.dataset = run.dataset._replace(pixels=run.dataset.pixels[:, :3].contiguous())
+        run.dataset = run.dataset.with_depth_maps([torch.full((1, 1), distance)] * 2)
+        for step in range(150):
+            run.step(step, 0.0)
+        rays = run.dataset.rays(torch.arange(60, 84))[0]
+        at.append(float(run.model.render(rays, torch.tensor(BACKGROUND)).depth.median()))
+    assert at[0] < at[1] - 0.4
 
 
 def test_points_beyond_a_bounded_box_are_no_guide() -> None:

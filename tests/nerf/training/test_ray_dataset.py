@@ -197,6 +197,27 @@ def test_viewing_distance_is_the_median_of_known_depths() -> None:
     assert known.viewing_distance.tolist() == [1.5, 3.25, 4.5], "the second view has none, and that of all"
 
 
+@pytest.mark.parametrize("times", [1, 2, 3])
+def test_depth_maps_of_other_sizes_are_read_where_pixels_are(times: int) -> None:
+    """Each pixel has a distance of its own; maps with every pixel ``times``² times give the same."""
+    dataset, *_ = scattered()
+    own = [view + 1.5 + torch.arange(h * w).view(h, w) / (h * w) for view, (h, w) in enumerate(SIZES)]
+    maps = [each.repeat_interleave(times, 0).repeat_interleave(times, 1) for each in own]
+    pixel = torch.arange(38)
+    _, view = dataset.rays(pixel)
+    known = dataset.with_depth_maps(maps).to("cpu")
+    assert torch.equal(known.depths(pixel, view), torch.cat([each.flatten() for each in own]))
+    whole = dataset.with_depth_maps([torch.tensor([[2.5]]), torch.tensor([[1.5]]), torch.tensor([[0.0]])])
+    nearer_than_near = torch.tensor([2.5] * 15 + [0.0] * 8 + [0.0] * 15)
+    assert torch.equal(whole.depths(pixel, view), nearer_than_near)
+
+
+def test_each_photo_needs_a_depth_map() -> None:
+    dataset, *_ = scattered()
+    with pytest.raises(ValueError, match="2 depth maps, and 3 photos"):
+        dataset.with_depth_maps([torch.ones(2, 2)] * 2)
+
+
 def test_distances_of_pixels_that_masks_ignore_are_forgotten() -> None:
     dataset, *_ = scattered()
     ignored = torch.zeros(SIZES[0], dtype=torch.bool)

@@ -9,6 +9,7 @@ from PIL import Image
 from pipeline.cli.commands import run_command
 from pipeline.engine import stage_list
 from pipeline.engine.settings import Settings
+from stages.train.config import Config
 
 
 def test_a_study_is_asked_for_by_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -71,4 +72,21 @@ def test_the_budget_of_a_study_belongs_to_it(tmp_path: Path, capsys: pytest.Capt
 def test_a_run_has_no_study_unless_it_is_named():
     assert "tradeoff" not in stage_list.usual() and stage_list.usual()[-1] == "report"
     assert "tradeoff" not in stage_list.up_to("mesh") and stage_list.up_to("tradeoff")[-1] == "tradeoff"
-    assert stage_list.needed_for("report") == ["report"]
+    assert stage_list.needed_for("report", {}) == ["report"]
+
+
+def test_depth_runs_where_training_reads_it():
+    without, with_depth = (dict(Settings(train=Config(depth=depth))) for depth in (False, True))
+    for options, runs in ((without, False), (with_depth, True)):
+        assert ("depth" in stage_list.up_to("report", options)) == runs
+        assert ("depth" in stage_list.needed_for("mesh", options)) == runs
+        assert "depth" not in stage_list.up_to("normalise", options) + stage_list.needed_for("effects", options)
+    stages = stage_list.up_to("report", with_depth)
+    assert stages.index("depth") < stages.index("train")
+
+
+def test_a_budget_does_not_pay_for_depth(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "photos").mkdir()
+    words = ["run", str(tmp_path / "photos"), "-o", str(tmp_path / "w"), "--budget", "5m", "--train.depth"]
+    assert run_command(words) == 2
+    assert "--budget and --train.depth" in capsys.readouterr().err

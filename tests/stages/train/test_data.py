@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from nerf.geometry.scene import Camera
 from nerf.training.ray_dataset import PosedViews, make_ray_dataset
-from stages.contract import StageError
+from stages.depth.consistency import DepthMap
+from stages.depth.files import depth_map_file, write_depth_map
 from stages.io.files import write_png, write_tensors
 from stages.io.pixel_store import PixelStore, pixel_store
 from stages.io.pixels import load_mask
@@ -28,6 +29,7 @@ from stages.train.data import (
     view_rays,
 )
 from tests.conftest import SilentProgress
+from tests.refusals import refused
 from tests.stages.photo_scene import CAMERA, FOCAL, HEIGHT, RADIUS, WIDTH, ball_photo, photographed, seen_points
 
 
@@ -233,12 +235,8 @@ def test_masks_that_leave_nothing_at_a_size_are_said(tmp_path: Path, progress: S
     mask[4, 4] = 255
     inputs, scene = photographed(tmp_path, mask=mask)
     assert training_dataset(inputs["ingest"], scene, "train", 1.0, progress).unmasked_count == 6
-    with pytest.raises(StageError) as error:
+    with refused("train.all-masked", "training photos", "--train.downscale"):
         training_dataset(inputs["ingest"], scene, "train", 2.0, progress)
-    assert str(error.value) == (
-        "nothing is left to train on: the masks ignore every pixel of the train photos at this size. "
-        "Give a smaller --train.downscale."
-    )
 
 
 @pytest.mark.parametrize("downscale", [1.0, 2.0, 3.3])
@@ -258,6 +256,24 @@ def test_the_bank_knows_where_training_photos_show_points(
     closest = torch.cdist(hit, torch.from_numpy(seen["xyz"])).min(-1).values
     assert (closest < half_a_pixel).all()
     assert float((hit.norm(dim=-1) - RADIUS).abs().mean()) < half_a_pixel / 2
+
+
+def test_depth_maps_are_those_of_the_training_photos(tmp_path: Path, progress: SilentProgress) -> None:
+    inputs, scene = photographed(tmp_path)
+    for number, view in enumerate(scene.views):
+        if view.split == "train":
+            path = depth_map_file(tmp_path, view.file)
+            path.parent.mkdir(exist_ok=True)
+            distance = np.full((2, 3), (view.near + view.far) / 2 + number / 1e3, np.float32)
+            write_depth_map(path, DepthMap(distance, distance / 100, np.full((2, 3), 2, np.uint8)))
+    dataset = guided_dataset(inputs, scene, 2.0, progress, tmp_path)
+    pixel = dataset.first_pixel[:-1] + 1
+    expected = [
+        (view.near + view.far) / 2 + number / 1e3 for number, view in enumerate(scene.views) if view.split == "train"
+    ]
+    assert len(expected) > 1
+    torch.testing.assert_close(dataset.depths(pixel, torch.arange(len(pixel))), torch.tensor(expected))
+    assert guided_dataset(inputs, scene, 2.0, progress).depth_maps is None
 
 
 def test_points_guide_once_two_training_photos_saw_them(tmp_path: Path, progress: SilentProgress) -> None:

@@ -12,6 +12,8 @@ from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.vanilla_trainer import VanillaTrainer
 from stages import train
 from stages.contract import Progress, run_stage
+from stages.depth.consistency import DepthMap
+from stages.depth.files import depth_map_file, write_depth_map
 from stages.hardware.device import cores
 from stages.io.field_files import load_field
 from stages.io.files import read_json
@@ -92,6 +94,24 @@ def test_the_grid_field_trains_from_photos_too(tmp_path: Path, progress) -> None
     assert 0.5 < colours < 100, "of a ray"
     (sizes,), (step,) = progress.said("train.sizes"), progress.said("train.step")
     assert "2^10" in sizes and "2.3 k pixels" in sizes and "1,024" in step and "0.057" in step
+
+
+def test_depth_maps_are_used_where_asked_for(tmp_path: Path, progress) -> None:
+    inputs, scene = photographed(tmp_path)
+    for view in scene.of_split("train"):
+        path = depth_map_file(tmp_path / "depth", view.file)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        distance = np.array([[0, (view.near + view.far) / 2]], np.float32)
+        write_depth_map(path, DepthMap(distance, distance / 100, (distance > 0).astype(np.uint8)))
+    fields = []
+    for depth in (False, True):
+        given = inputs | ({"depth": tmp_path / "depth"} if depth else {})
+        trained(tmp_path / f"train{depth}", given, progress, field="grid", steps=4, depth=depth)
+        assert set(train.more_inputs(Config(depth=depth))) == given.keys() - inputs.keys()
+        fields.append((tmp_path / f"train{depth}" / "field.safetensors").read_bytes())
+    assert fields[0] != fields[1]
+    (known,) = progress.said("train.depth-maps")
+    assert "50%" in known
 
 
 def test_that_samples_stand_farther_apart_with_distance_is_said(tmp_path: Path, progress) -> None:
@@ -224,6 +244,7 @@ def test_two_budgets_are_refused_in_words() -> None:
             {"field": "grid", "vanilla": {"hierarchical": False}},
             "vanilla.hierarchical has no effect with --train.field",
         ),
+        ({"field": "vanilla", "depth": True}, "depth has no effect with --train.field vanilla"),
         ({"preset": "paper", "grid": {"num_levels": 4}}, "grid.num-levels has no effect with --train.preset paper"),
         ({"field": "vanilla", "grid": {"num_levels": 4}}, "grid.num-levels has no effect with --train.field vanilla"),
         ({"grid": {"max_res": 64}, "vanilla": {"depth": 4}}, "vanilla.depth has no effect with --train.grid.max-res"),
