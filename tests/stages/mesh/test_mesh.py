@@ -103,7 +103,7 @@ def run_mesh(tmp_path, progress, monkeypatch):
         info = {"rays": 1000, "effects": learnt or {}}
         write_json(inputs["train"] / "field.json", info)
         monkeypatch.setattr(extraction, "load_field", lambda *_: (model, info))
-        config = mesh.Config.model_validate({"resolution": 48} | settings)
+        config = mesh.Config.model_validate({"resolution": 48, "texture_size": 0} | settings)
         return run_stage(mesh, config, inputs, tmp_path / folder, progress), tmp_path / folder
 
     return run
@@ -320,3 +320,46 @@ def test_the_resolution_follows_the_training(tmp_path, progress, rays, resolutio
     write_json(tmp_path / "field.json", {"rays": rays})
     assert mesh.plan(mesh.Config(), {"train": tmp_path}, progress).resolution == resolution
     assert mesh.plan(mesh.Config(resolution=77), {"train": tmp_path}, progress).resolution == 77
+
+
+def test_faces_outside_of_the_box_are_left_out(run_mesh):
+    upper = (-1.0, -1.0, 0.0, 1.0, 1.0, 1.0)
+    result, folder = run_mesh(Solid(ball), box=upper, frame="scene")
+    vertices = np.asarray(trimesh.load_mesh(folder / "mesh.ply", process=False).vertices)
+    assert 0 <= vertices[:, 2].min() < VOXEL and abs(vertices[:, 2].max() - RADIUS) < VOXEL
+    assert result.facts["watertight"] is False
+    with refused("mesh.nothing-in-box", "0.4"):
+        run_mesh(Solid(ball), folder="beside", box=(0.8, 0.8, 0.8, 0.9, 0.9, 0.9), frame="scene")
+
+
+def test_closing_says_how_much_is_invented(run_mesh):
+    upper = (-1.0, -1.0, 0.0, 1.0, 1.0, 1.0)
+    result, folder = run_mesh(Solid(ball), box=upper, frame="scene", close=1.0, formats=("stl", "3mf", "ply"))
+    assert result.facts["watertight"] is True and result.facts["boundary"] == "watertight"
+    assert (result.facts["holes_closed"], result.facts["holes_left"]) == (1, 0)
+    assert result.facts["invented_area_share"] == pytest.approx(1 / 3, abs=0.03), "a disc, beside half a ball"
+    assert result.line.endswith("% of the area invented")
+    for name in ("mesh.stl", "mesh.ply"):
+        assert trimesh.load_mesh(folder / name).is_watertight
+    kept, _ = run_mesh(Solid(ball), folder="open", box=upper, frame="scene", close=0.1)
+    assert (kept.facts["holes_closed"], kept.facts["holes_left"]) == (0, 1)
+
+
+class Undefined(Solid):
+    """A field whose colours are not finite."""
+
+    def colour(self, points):
+        return super().colour(points) * math.nan
+
+
+def test_colours_that_are_not_finite_are_refused(run_mesh, tmp_path):
+    with refused("mesh.colours-not-finite", "NaN"):
+        run_mesh(Undefined(ball))
+    assert list((tmp_path / "mesh").iterdir()) == []
+
+
+def test_faces_follow_whether_there_is_a_texture(tmp_path, progress):
+    write_json(tmp_path / "field.json", {"rays": 1000})
+    for size, faces in ((4096, mesh.TEXTURED_FACES), (0, mesh.COLOURED_FACES)):
+        assert mesh.plan(mesh.Config(texture_size=size), {"train": tmp_path}, progress).max_faces == faces
+    assert mesh.plan(mesh.Config(max_faces=500), {"train": tmp_path}, progress).max_faces == 500
