@@ -26,7 +26,7 @@ from pipeline.demo.truth import Truth, compare_with_truth
 from pipeline.engine.display import SilentDisplay
 from pipeline.engine.workspace import Workspace
 from stages.contract import Inputs
-from stages.mesh import Config
+from stages.mesh import COLOURED_FACES, Config
 from stages.mesh.extraction import extract_mesh, load, write_mesh
 from stages.mesh.files import ColouredMesh
 from stages.mesh.surface import sample_surface
@@ -56,7 +56,9 @@ def figures(folders: Inputs, resolution: int, truth: Truth | None) -> dict[str, 
     """One resolution's row of the table."""
     source = load(folders, SilentDisplay())
     started = time.perf_counter()
-    made = extract_mesh(Config(resolution=resolution), source, SilentDisplay())
+    made = extract_mesh(
+        Config(resolution=resolution, max_faces=COLOURED_FACES, texture_size=0), source, SilentDisplay()
+    )
     seconds = time.perf_counter() - started
     if truth is None:
         known = to_points(made.mesh, source.points)

@@ -153,6 +153,10 @@ class ColourEffect(Protocol):
         """What the images show of ``colour`` (sRGB, may exceed 1), which the calibrated ``rays`` meet."""
         ...
 
+    def inverse(self, shown: Float[Tensor, "rays 3"], rays: Rays, view: Int[Tensor, "rays"]) -> Float[Tensor, "rays 3"]:
+        """The colours of which the images show ``shown``."""
+        ...
+
     def backward(
         self, colour: Float[Tensor, "rays 3"], rays: Rays, view: Int[Tensor, "rays"], grad: Float[Tensor, "rays 3"]
     ) -> tuple[Float[Tensor, "rays 3"], dict[str, Tensor]]:

@@ -94,6 +94,10 @@ class ExposureModel:
         """The colours at the gains of their photos."""
         return expose(colour, self.log_gain.index_select(0, view))
 
+    def inverse(self, shown: Float[Tensor, "rays 3"], rays: Rays, view: Int[Tensor, "rays"]) -> Float[Tensor, "rays 3"]:
+        """Log gains add up to nothing."""
+        return expose(shown, -self.log_gain.index_select(0, view))
+
     def backward(
         self, colour: Float[Tensor, "rays 3"], rays: Rays, view: Int[Tensor, "rays"], grad: Float[Tensor, "rays 3"]
     ) -> tuple[Float[Tensor, "rays 3"], dict[str, Tensor]]:

@@ -110,6 +110,10 @@ class VignettingModel:
         """The colours at the gains of their angles."""
         return expose(colour, self._log_gain(self._terms(rays, view), view))
 
+    def inverse(self, shown: Float[Tensor, "rays 3"], rays: Rays, view: Int[Tensor, "rays"]) -> Float[Tensor, "rays 3"]:
+        """Log gains add up to nothing."""
+        return expose(shown, -self._log_gain(self._terms(rays, view), view))
+
     def backward(
         self, colour: Float[Tensor, "rays 3"], rays: Rays, view: Int[Tensor, "rays"], grad: Float[Tensor, "rays 3"]
     ) -> tuple[Float[Tensor, "rays 3"], dict[str, Tensor]]:

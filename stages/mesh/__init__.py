@@ -1,7 +1,7 @@
-"""Stage mesh: the field's density becomes a coloured triangle mesh.
+"""Stage mesh: the field's density becomes a triangle mesh that looks like the photos.
 
 Density on a grid over the region of interest → marching cubes at the iso-level where the photos' rays stop → only what
-the photos see → decimation → vertex colours from the field → GLB, PLY, OBJ.
+the photos see → decimation → holes closed, if asked for → a texture from the photos → GLB, PLY, OBJ, STL, 3MF.
 A surface that leaves the region of interest ends there, open: closing it would invent geometry.
 """
 
@@ -11,18 +11,27 @@ from typing import Literal
 from pydantic import Field
 
 from stages.contract import Auto, Flexible, Inputs, Progress, StageConfig, StageResult, Workload
+from stages.hardware.device import processors
+from stages.io.files import read_scene
 from stages.train import trained_seconds
 
 INPUTS = ("ingest", "normalise", "train")
-VERSION = 13
+VERSION = 14
 EXIT_CODE = 17
 RESUMES = False
-PUBLISHED = ("mesh.glb", "mesh.ply", "mesh.obj")
+PUBLISHED = ("mesh.glb", "mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "mesh.stl", "mesh.3mf")
 NOT_HASHED = ("seconds",)  # it decides the resolution, and that enters the key
 FLEXIBLE = Flexible(share=0.12, min_seconds=8.0, max_seconds=60.0)
 
-Format = Literal["glb", "ply", "obj"]
+# Of a texture, besides decoding the photos twice: in all, and of a core for each photo. Fox with 100,000 faces takes 5
+# and 19 s of a core for its 43 training photos (docs/experiments/mesh.md).
+TEXTURE_SECONDS, TEXTURE_SECONDS_PER_PHOTO = 5.0, 0.45
+MIN_SHARE_OF_SHAPE = 0.3  # of a time limit, that a texture leaves
+
+Format = Literal["glb", "ply", "obj", "stl", "3mf"]
 Keep = Literal["visible", "largest", "all"]
+# Faces by default. With a texture, fewer show the same (docs/experiments/mesh.md); without one, each shows a colour.
+TEXTURED_FACES, COLOURED_FACES = 100_000, 300_000
 
 
 class Config(StageConfig):
@@ -47,26 +56,68 @@ class Config(StageConfig):
     min_component: float = Field(
         default=0.01, ge=0, le=1, description="Area of the smallest component kept, as a fraction of the largest one's."
     )
-    max_faces: int = Field(default=300_000, ge=100, description="Maximum number of faces after decimation.")
+    box: Auto[tuple[float, float, float, float, float, float]] = Field(
+        default=None,
+        description=(
+            "Keep only what lies in this box: its lowest x, y, z and its highest, in the frame of the files "
+            "(default: everything)."
+        ),
+    )
+    max_faces: Auto[int] = Field(
+        default=None,
+        ge=100,
+        description="Maximum number of faces after decimation (default: 100000, without a texture 300000).",
+    )
+    close: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description=(
+            "Close holes up to this size, as a fraction of the mesh's; 1 closes all of them, for printing. What is "
+            "closed is invented."
+        ),
+    )
+    texture_size: int = Field(
+        default=4096,
+        ge=0,
+        le=8192,
+        description=(
+            "Maximum side of the texture in texels; it is smaller where the photos show no more. 0: a colour per "
+            "vertex."
+        ),
+    )
     formats: tuple[Format, ...] = Field(default=("glb", "ply"), min_length=1, description="File formats to write.")
     frame: Literal["sfm", "scene"] = Field(default="sfm", description="Coordinate frame of the files.")
 
 
 def expected_seconds(config: Config, workload: Workload) -> float | None:
-    """5 s and about a seventh of the training's seconds (fox, fountain_p11 and the demo, after three minutes)."""
+    """5 s and about a seventh of the training's seconds (fox, fountain_p11 and the demo, after three minutes); for a
+    texture, time for each photo besides."""
     if config.seconds is not None:
         return config.seconds
-    trained = trained_seconds(workload)
-    return None if trained is None else 5.0 + 0.15 * trained
+    trained, photos, cores = trained_seconds(workload), workload.photos, workload.cores
+    reading = 0.0 if config.texture_size == 0 else 2 * photos.reading_seconds(cores)
+    return None if trained is None else 5.0 + 0.15 * trained + _texture_seconds(config, photos.number, cores) + reading
+
+
+def _texture_seconds(config: Config, photos: int, cores: int) -> float:
+    """What a texture takes, besides decoding the photos."""
+    return 0.0 if config.texture_size == 0 else TEXTURE_SECONDS + TEXTURE_SECONDS_PER_PHOTO * photos / cores
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
-    """Choose the resolution: from the training, or from ``seconds`` and the speed of this machine."""
+    """Choose the resolution: from the training, or from what a texture leaves of ``seconds`` and the speed of this
+    machine; and the number of faces."""
     from stages.mesh.resolution import choose_resolution
 
-    if config.resolution is not None:
-        return config
-    return config.model_copy(update={"resolution": choose_resolution(config.seconds, inputs, progress)})
+    faces, resolution = TEXTURED_FACES if config.texture_size else COLOURED_FACES, config.resolution
+    if resolution is None:
+        seconds = config.seconds
+        if seconds is not None:
+            photos = len(read_scene(inputs["normalise"]).of_split("train"))
+            seconds = max(MIN_SHARE_OF_SHAPE * seconds, seconds - _texture_seconds(config, photos, processors()))
+        resolution = choose_resolution(seconds, inputs, progress)
+    return config.model_copy(update={"resolution": resolution, "max_faces": config.max_faces or faces})
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:

@@ -1,4 +1,4 @@
-"""From a trained field to a mesh: density grid, iso-level, marching cubes, cleaning, decimation, colours, files."""
+"""From a trained field to a mesh: density grid, iso-level, marching cubes, cleaning, decimation, texture, files."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -11,7 +11,7 @@ from nerf.fields.density_grid import DensityGrid, sample_density_grid
 from nerf.fields.interface import RadianceModel
 from nerf.geometry.scene import Scene
 from nerf.rendering.volume_rendering import composite
-from stages.contract import Inputs, Progress, StageResult
+from stages.contract import Inputs, Progress, StageError, StageResult
 from stages.effects.image_effects import new_view_words
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_bytes, check_memory
@@ -19,11 +19,13 @@ from stages.io.field_files import load_field
 from stages.io.files import read_scene, read_tensors, write_png
 from stages.mesh.cleaning import Cleaned, boundary, clean
 from stages.mesh.files import WRITERS, Z_UP_TO_Y_UP, ColouredMesh
-from stages.mesh.iso_level import IsoLevel, check_range, choose_iso_level
+from stages.mesh.holes import Closed, close_holes
+from stages.mesh.iso_level import RETRAIN, IsoLevel, check_range, choose_iso_level
 from stages.mesh.marching_cubes import extract_surface
 from stages.mesh.preview import preview
 from stages.mesh.resolution import CHUNK, grid_box, point_cost, points_per_edge, slab_factor
-from stages.mesh.surface import Surface, decimate, face_areas, vertex_normals
+from stages.mesh.surface import Surface, decimate, face_areas, is_watertight, keep_faces, vertex_normals
+from stages.mesh.texture.texturing import Textured, texture_of
 from stages.mesh.visibility import ShadowMap, sample_rays, shadow_maps, vertex_visibility
 
 if TYPE_CHECKING:
@@ -47,13 +49,16 @@ class Source(NamedTuple):
 
 
 class Extracted(NamedTuple):
-    """``mesh`` in the scene frame, how it came about, and ``boundary``: where it ends. ``voxel`` is in scene units."""
+    """``mesh`` in the scene frame, how it came about, what was ``closed``, ``boundary``: where it ends, and the
+    texture with what is known of it. ``voxel`` is in scene units."""
 
     mesh: ColouredMesh
     iso_level: IsoLevel
     cleaned: Cleaned
+    closed: Closed
     boundary: str
     voxel: float
+    textured: Textured | None
 
 
 def load(inputs: Inputs, progress: Progress) -> Source:
@@ -65,28 +70,71 @@ def load(inputs: Inputs, progress: Progress) -> Source:
 
 
 def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extracted:
-    """The mesh of the field; ``config.resolution`` must be set. Raises StageError without a surface."""
+    """The mesh of the field; ``config`` must be planned. Raises StageError without a surface."""
+    assert config.max_faces is not None
     box = grid_box(source.scene.capture_type, source.points)
     grid = _density_grid(config, source, box, progress)
     voxel = float(grid.spacing().max())
     views = source.scene.of_split("train")
     maps = shadow_maps(
-        grid, source.scene, source.ingest, views, lambda done: progress.update("visibility", 0.6 + 0.2 * done)
+        grid, source.scene, source.ingest, views, lambda done: progress.update("visibility", 0.4 + 0.1 * done)
     )
     iso_level = _iso_level(config, grid, source.model, maps, progress)
-    progress.update("marching cubes", 0.8)
+    progress.update("marching cubes", 0.5)
     raw = extract_surface(grid, iso_level.density)
     visibility = vertex_visibility(raw.vertices, vertex_normals(raw), maps, voxel)
-    progress.update("cleaning", 0.85)
+    progress.update("cleaning", 0.55)
     min_views = min(config.min_views, len(views))
     cleaned = clean(raw, visibility, source.points, config.keep, min_views, config.min_component)
-    surface = decimate(cleaned.surface, config.max_faces)
-    progress.update("colours", 0.9)
+    surface = decimate(_cropped(config, cleaned.surface, source.scene), config.max_faces)
+    ends = boundary(surface, box, voxel)
+    if config.close:
+        surface, closed = close_holes(surface, config.close)
+        ends = "watertight" if is_watertight(surface) else ends
+    else:
+        closed = Closed(0, 0, 0.0)
+    progress.update("colours", 0.6)
     nearest = KDTree(cleaned.surface.vertices).query(surface.vertices)[1]
     directions = visibility.direction[cleaned.vertex[nearest]]
     colours = vertex_colours(source.model, cleaned.surface.vertices[nearest], directions, voxel, source.device)
-    mesh = ColouredMesh(*surface, vertex_normals(surface), colours)
-    return Extracted(mesh, iso_level, cleaned, boundary(surface, box, voxel), voxel)
+    textured = _textured(config, surface, colours, source, voxel, progress)
+    mesh = ColouredMesh(*surface, vertex_normals(surface), colours, textured and textured.texture)
+    return Extracted(mesh, iso_level, cleaned, closed, ends, voxel, textured)
+
+
+def _cropped(config: "Config", surface: Surface, scene: Scene) -> Surface:
+    """The faces that lie in the box asked for."""
+    if config.box is None:
+        return surface
+    vertices = scene.scene_from_sfm.inverse().points(surface.vertices) if config.frame == "sfm" else surface.vertices
+    low, high = np.array(config.box).reshape(2, 3)
+    within = np.all((vertices >= low) & (vertices <= high), axis=1)
+    inside = np.all(within[surface.faces], axis=1)
+    if not inside.any():
+        ends = [", ".join(f"{x:.4g}" for x in end) for end in (vertices.min(axis=0), vertices.max(axis=0))]
+        why = f"in the {config.frame} frame the mesh reaches from {ends[0]} to {ends[1]}"
+        raise StageError(
+            "mesh.nothing-in-box", "no face of the mesh lies in --mesh.box", why, "Give a box within that."
+        )
+    return keep_faces(surface, inside)[0]
+
+
+def _textured(
+    config: "Config", surface: Surface, colours: np.ndarray, source: Source, voxel: float, progress: Progress
+) -> Textured | None:
+    """The texture asked for; None for one colour per vertex."""
+    if config.texture_size == 0:
+        return None
+
+    def report(what: str, done: float) -> None:
+        progress.update(what, 0.65 + 0.3 * done)
+
+    textured = texture_of(
+        surface, colours, source.scene, source.ingest, source.info, voxel, config.texture_size, report
+    )
+    if textured is None:
+        progress.note("mesh.no-photo-sees-it", "no photo sees the surface: it has colours of the field and no texture")
+    return textured
 
 
 def _density_grid(config: "Config", source: Source, box: np.ndarray, progress: Progress) -> DensityGrid:
@@ -99,7 +147,7 @@ def _density_grid(config: "Config", source: Source, box: np.ndarray, progress: P
     low, high = torch.tensor(box, dtype=torch.float32, device=source.device)
 
     def report(done: float) -> None:
-        progress.update(f"density at {config.resolution}³ points", 0.6 * done)
+        progress.update(f"density at {config.resolution}³ points", 0.4 * done)
 
     return sample_density_grid(source.model, points_per_edge(box, config.resolution), low, high, CHUNK, report)
 
@@ -123,7 +171,8 @@ def vertex_colours(
     to one behind it.
 
     A field's colour means something only where the field is dense, and a vertex of a coarse grid may lie beside that.
-    Colours are divided by the opacity; where the ray meets nothing, the last sample counts.
+    Colours are divided by the opacity; where the ray meets nothing, the last sample counts. Raises StageError where
+    one is not finite.
     """
     t = torch.linspace(-voxel, voxel, COLOUR_SAMPLES + 1, device=device)
     colours = []
@@ -136,7 +185,11 @@ def vertex_colours(
             pixel, _ = composite(density, colour, t.expand(len(points), -1), torch.zeros(1, 3, device=device))
         opaque = pixel.opacity[:, None] > 0
         colours.append(torch.where(opaque, pixel.colour / pixel.opacity[:, None], colour[:, -1]))
-    return (torch.cat(colours).clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    found = torch.cat(colours)
+    if broken := int((~found.isfinite()).any(dim=1).sum()):
+        why = f"those of {broken} of {len(found)} vertices are NaN or infinite"
+        raise StageError("mesh.colours-not-finite", "the field's colours are not finite", why, RETRAIN)
+    return (found.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def save(config: "Config", extracted: Extracted, source: Source, folder: Path) -> StageResult:
@@ -144,7 +197,11 @@ def save(config: "Config", extracted: Extracted, source: Source, folder: Path) -
     outputs = write_mesh(config, extracted.mesh, source.scene, folder)
     faces, components = len(extracted.mesh.faces), extracted.cleaned.kept
     count = f"{faces / 1000:.0f} k faces" if faces >= 10_000 else f"{faces} faces"
+    if (texture := extracted.mesh.texture) is not None:
+        count += f", texture {texture.atlas.width} × {texture.atlas.height}"
     line = f"{count}, {components} component{'s' * (components > 1)}, {extracted.boundary}"
+    if extracted.closed.holes:
+        line += f", {extracted.closed.area_share:.1%} of the area invented"
     if not extracted.iso_level.well_defined:
         line += "; the field has no clear surface yet, train for longer"
     appearance = new_view_words(source.info)
@@ -162,9 +219,11 @@ def write_mesh(config: "Config", mesh: ColouredMesh, scene: Scene, folder: Path)
         vertices, normals = sfm_from_scene.points(mesh.vertices), mesh.normals @ sfm_from_scene.rotation.T
         mesh = mesh._replace(vertices=vertices, normals=normals)
         upright = upright @ scene.scene_from_sfm.rotation
-    names = [f"mesh.{extension}" for extension in sorted(set(config.formats))]
-    for name in names:
-        (folder / name).write_bytes(WRITERS[name.removeprefix("mesh.")](mesh, upright))
+    names = []
+    for extension in sorted(set(config.formats)):
+        for name, content in WRITERS[extension](mesh, upright).items():
+            (folder / name).write_bytes(content)
+            names.append(name)
     return (*names, "preview.png")
 
 
@@ -172,7 +231,7 @@ def _facts(config: "Config", extracted: Extracted, scene: Scene) -> dict[str, ob
     """Plain values for the report; lengths are in the frame of the files."""
     unit = 1 / scene.scene_from_sfm.scale if config.frame == "sfm" else 1.0
     mesh, cleaned, iso_level = extracted.mesh, extracted.cleaned, extracted.iso_level
-    return {
+    return _texture_facts(extracted.textured) | {
         "vertices": len(mesh.vertices),
         "faces": len(mesh.faces),
         "watertight": extracted.boundary == "watertight",
@@ -181,6 +240,9 @@ def _facts(config: "Config", extracted: Extracted, scene: Scene) -> dict[str, ob
         "components_dropped": cleaned.dropped,
         "faces_outside_photos": cleaned.outside,
         "faces_hidden": cleaned.hidden,
+        "holes_closed": extracted.closed.holes,
+        "holes_left": extracted.closed.left,
+        "invented_area_share": extracted.closed.area_share,
         "iso_level": iso_level.density,
         "iso_level_reason": iso_level.reason,
         "surface_error_voxels": iso_level.surface_error_voxels,
@@ -188,4 +250,16 @@ def _facts(config: "Config", extracted: Extracted, scene: Scene) -> dict[str, ob
         "voxel": extracted.voxel * unit,
         "surface_area": float(face_areas(Surface(mesh.vertices, mesh.faces)).sum()) * unit**2,
         "frame": config.frame,
+    }
+
+
+def _texture_facts(textured: Textured | None) -> dict[str, object]:
+    if textured is None:
+        return {"texture": None}
+    atlas = textured.texture.atlas
+    return {
+        "texture": f"{atlas.width} × {atlas.height}",
+        "texels_per_pixel": round(atlas.texels_per_pixel, 3),
+        "texture_without_photo": round(textured.unseen, 4),
+        "texture_outliers": round(textured.outliers, 4),
     }

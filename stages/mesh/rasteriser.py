@@ -1,8 +1,9 @@
 """A shaded picture of a mesh without GPU, display or library: a z-buffer in numpy.
 
-Every triangle is tested against the pixels of its bounding box, all triangles at once and in blocks of fixed size.
+Triangles are cut into rows of pixels, all triangles at once and in blocks of about fixed size.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from stages.mesh.surface import face_area_vectors
 
 SUPERSAMPLING = 2
 FIELD_OF_VIEW = 35.0  # degrees
-CHUNK = 1 << 17  # triangle-pixel pairs tested at a time: what fits into a processor's cache
+CHUNK = 1 << 17  # triangle-pixel pairs at a time, about: what fits into a processor's cache
 KEY_LIGHT, HEADLIGHT, AMBIENT = 0.45, 0.30, 0.30  # fractions of the shading; together a little over 1
 TOWARDS_LIGHT = np.array([-0.5, -0.75, -0.45]) / np.linalg.norm([0.5, 0.75, 0.45])  # camera axes: upper left, behind
 CLAY = np.array([205, 200, 192], np.uint8)
@@ -51,7 +52,7 @@ def rasterise(vertices: np.ndarray, faces: np.ndarray, camera: Viewpoint) -> Fra
     usable = np.flatnonzero((depth > 1e-6 * np.abs(points).max(initial=1e-30))[faces].all(axis=1))
     divisor = np.where(depth > 0, depth, 1.0)[:, None]
     pixels = points[:, :2] / divisor * camera.focal_px + [camera.width / 2, camera.height / 2]
-    winner = _nearest_faces(pixels, depth, faces[usable], camera)
+    winner, _ = nearest_faces(pixels, depth, faces[usable], camera.width, camera.height)
     pixel = np.flatnonzero(winner >= 0)
     face = usable[winner[pixel]]
     return Fragments(pixel, face, *_lit(points, faces, face, pixel, camera))
@@ -88,41 +89,76 @@ def _in_camera(vertices: np.ndarray, camera: Viewpoint) -> np.ndarray:
     return (vertices - camera.from_camera[:, 3]) @ camera.from_camera[:, :3]
 
 
-def _nearest_faces(pixels: np.ndarray, depth: np.ndarray, faces: np.ndarray, camera: Viewpoint) -> np.ndarray:
-    """The face in front at each pixel, flat, -1 where there is none."""
-    corners = pixels[faces]
-    size = np.array([camera.width, camera.height])
-    first = np.clip(np.ceil(corners.min(axis=1) - 0.5), 0, size).astype(np.int64)
-    last = np.clip(np.floor(corners.max(axis=1) - 0.5), -1, size - 1).astype(np.int64)
-    extent = np.maximum(last - first + 1, 0)
-    pairs = extent.prod(axis=1)
-    inverse_depth = 1 / depth[faces]
-    best = np.zeros(camera.width * camera.height)
-    winner = np.full(camera.width * camera.height, -1)
-    todo = np.flatnonzero(pairs)
-    ends = np.cumsum(pairs[todo])
-    for block in np.split(todo, np.searchsorted(ends, np.arange(CHUNK, ends[-1], CHUNK)) if len(ends) else []):
-        face = np.repeat(block, pairs[block])
-        within = np.arange(len(face)) - np.repeat(np.cumsum(pairs[block]) - pairs[block], pairs[block])
-        row, column = np.divmod(within, extent[face, 0])
-        x, y = first[face, 0] + column, first[face, 1] + row
-        barycentric = _barycentric(corners[face], np.stack([x, y], axis=1) + 0.5)
-        inside = (barycentric >= 0).all(axis=1)
-        face, pixel = face[inside], y[inside] * camera.width + x[inside]
-        nearness = (barycentric[inside] * inverse_depth[face]).sum(axis=1)
-        order = np.argsort(nearness, kind="stable")  # of equal pixels the last, nearest, assignment stands
-        pixel, face, nearness = pixel[order], face[order], nearness[order]
-        front = nearness > best[pixel]
-        best[pixel[front]], winner[pixel[front]] = nearness[front], face[front]
-    return winner
+def nearest_faces(
+    pixels: np.ndarray, depth: np.ndarray, faces: np.ndarray, width: int, height: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """A z-buffer: the face in front at each pixel of an image, -1 where there is none, and 1/depth there, both flat.
+
+    ``pixels`` (n, 2) are where a camera shows the vertices, at ``depth`` (n,) along its axis; all ``faces`` must lie in
+    front of it. 1/depth is linear across a face, so depths are right in perspective.
+    """
+    front, winner = np.zeros(width * height), np.full(width * height, -1)
+    inverse_depth = 1 / depth[faces] if len(faces) else np.zeros((0, 3))
+    for face, row, column in covered_pixels(pixels[faces], width, height):
+        weights = barycentric(pixels[faces[face]], np.stack([column, row], axis=1) + 0.5)
+        nearness, pixel = (weights * inverse_depth[face]).sum(axis=1), row * width + column
+        np.maximum.at(front, pixel, nearness)
+        ahead = nearness == front[pixel]
+        winner[pixel[ahead]] = face[ahead]
+    return winner, front
 
 
-def _barycentric(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates (n, 3) of points in 2-D triangles (n, 3, 2); negative for triangles without area."""
+def covered_pixels(corners: np.ndarray, width: int, height: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Triangles (n, 3, 2) and the pixels whose centres they cover, in blocks of (triangle, row, column), in the order
+    of the triangles.
+
+    A centre on an edge belongs to the triangle on its right or below, so that triangles that share edges share no
+    pixel; those without area have none. ``corners`` must be finite.
+    """
+    first, last = _centres(corners[:, :, 1].min(axis=1), corners[:, :, 1].max(axis=1), height)
+    rows = np.maximum(last - first, 0)
+    across = np.ptp(corners[:, :, 0], axis=1).clip(max=width)
+    todo = np.flatnonzero(rows)
+    pairs = np.cumsum(rows[todo] * (across[todo] + 1))
+    for block in np.split(todo, np.searchsorted(pairs, np.arange(CHUNK, pairs[-1], CHUNK))) if len(todo) else []:
+        triangle = np.repeat(block, rows[block])
+        row = first[triangle] + _counted(rows[block])
+        low, high = _centres(*_span(corners[triangle], row + 0.5), width)
+        columns = np.maximum(high - low, 0)
+        yield np.repeat(triangle, columns), np.repeat(row, columns), np.repeat(low, columns) + _counted(columns)
+
+
+def _centres(low: np.ndarray, high: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """The first pixel whose centre is in [low, high) and the one after the last, of ``size`` pixels."""
+    first, last = (np.ceil(end - 0.5).clip(0, size).astype(np.int64) for end in (low, high))
+    return first, last
+
+
+def _counted(lengths: np.ndarray) -> np.ndarray:
+    """0 … n - 1 for each n of ``lengths``, one after another."""
+    return np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+
+
+def _span(corners: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Between which x each triangle (n, 3, 2) crosses the line at its ``y`` (n,). Two triangles that share an edge get
+    the same x for it, to the bit: its ends are taken in the order of their y."""
+    low, high = np.full(len(y), np.inf), np.full(len(y), -np.inf)
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        swapped = (corners[:, a, 1] > corners[:, b, 1])[:, None]
+        (ax, ay), (bx, by) = (np.where(swapped, corners[:, i], corners[:, j]).T for i, j in ((b, a), (a, b)))
+        crosses = (ay <= y) & (y < by)
+        x = ax + (y - ay) * np.divide(bx - ax, by - ay, out=np.zeros_like(y), where=crosses)
+        low[crosses] = np.minimum(low, x)[crosses]
+        high[crosses] = np.maximum(high, x)[crosses]
+    return low, high
+
+
+def barycentric(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates (n, 3) of points (n, 2) in 2-D triangles (n, 3, 2); the middle of those without area."""
     edges = corners - point[:, None]
     parts = _cross(edges[:, [1, 2, 0]], edges[:, [2, 0, 1]])
     area = parts.sum(axis=1, keepdims=True)
-    return np.divide(parts, area, out=np.full_like(parts, -1.0), where=area != 0)
+    return np.divide(parts, area, out=np.full_like(parts, 1 / 3), where=area != 0)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

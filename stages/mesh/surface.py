@@ -84,7 +84,7 @@ def _folded_pairs(faces: np.ndarray) -> np.ndarray:
 
 def is_watertight(surface: Surface) -> bool:
     """Whether every edge belongs to exactly two faces, which pass it in opposite directions."""
-    start, end = _directed_edges(surface)
+    start, end = directed_edges(surface)
     size = len(surface.vertices)
     forth, count = np.unique(start * size + end, return_counts=True)
     return bool((count == 1).all() and np.array_equal(forth, np.unique(end * size + start)))
@@ -92,13 +92,14 @@ def is_watertight(surface: Surface) -> bool:
 
 def border_vertices(surface: Surface) -> np.ndarray:
     """Positions of the ends of every edge that belongs to one face only, (2 × edges, 3)."""
-    start, end = _directed_edges(surface)
+    start, end = directed_edges(surface)
     size = len(surface.vertices)
     edge, count = np.unique(np.minimum(start, end) * size + np.maximum(start, end), return_counts=True)
     return surface.vertices[np.concatenate(np.divmod(edge[count == 1], size))]
 
 
-def _directed_edges(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+def directed_edges(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """Start and end of the three edges of each face, one face after another."""
     faces = surface.faces.astype(np.int64)
     return faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
 

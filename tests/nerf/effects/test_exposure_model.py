@@ -114,3 +114,11 @@ def test_the_reference_exposure_is_that_of_a_usual_photo(count: int) -> None:
     (reference,) = ExposureModel.of_new_view(gains).rows
     assert (gains.min(0).values <= reference).all() and (reference <= gains.max(0).values).all()
     assert abs(float(reference[0]) - 0.5) <= 0.5 / max(1, count - 1) + (count == 1) * 0.5
+
+
+def test_what_a_photo_shows_leads_back_to_the_scene() -> None:
+    colour = 0.05 + 0.8 * torch.rand(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    effect, rays = ExposureModel(GAINS), any_rays(torch.zeros(4, dtype=torch.float64))
+    shown = effect.forward(colour, rays, VIEW)
+    assert (shown - colour).abs().max() > 0.05
+    torch.testing.assert_close(effect.inverse(shown, rays, VIEW), colour)

@@ -174,3 +174,10 @@ def test_new_views_are_as_bright_as_the_middle_everywhere() -> None:
     shown = effect.forward(grey(3), rays_at(0.0, 30.0, 180.0), torch.zeros(3, dtype=torch.int64))
     torch.testing.assert_close(shown, expose(grey(3), torch.full((3, 3), 0.7).double()))
     assert VignettingModel.new_view_words(ROWS) == "without vignetting of 1.01 EV at the corners"
+
+
+def test_what_a_photo_shows_leads_back_to_the_scene() -> None:
+    effect, rays, view = of_two_cameras(), rays_at(0, 10, 20, 30), torch.tensor([0, 1, 2, 0])
+    shown = effect.forward(grey(4), rays, view)
+    assert float(shown.diff(dim=0).abs().max()) > 0.05
+    torch.testing.assert_close(effect.inverse(shown, rays, view), grey(4))

@@ -1,8 +1,10 @@
-"""PLY, OBJ and GLB: read back by another library, upright, precise far from the origin, equal bytes."""
+"""Mesh files: read back by another library, upright, precise far from the origin, equal bytes."""
 
 import json
 import struct
+import zipfile
 from typing import get_args
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -10,7 +12,16 @@ import trimesh
 from trimesh.visual import ColorVisuals
 
 from stages.mesh import Format
-from stages.mesh.files import WRITERS, Z_UP_TO_Y_UP, ColouredMesh, glb_bytes, obj_bytes, ply_bytes
+from stages.mesh.files import (
+    WRITERS,
+    Z_UP_TO_Y_UP,
+    ColouredMesh,
+    glb_bytes,
+    obj_files,
+    ply_bytes,
+    stl_bytes,
+    threemf_bytes,
+)
 
 VERTICES = np.array([[0.1, 0, 0], [1, 0.2, 0], [0, 1, 0.3], [0.4, 0, 1]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
@@ -67,7 +78,7 @@ def test_ply_is_read_back_as_it_was(tmp_path, mesh):
 
 
 def test_obj_is_read_back_as_it_was(tmp_path, mesh):
-    (tmp_path / "mesh.obj").write_bytes(obj_bytes(mesh))
+    (tmp_path / "mesh.obj").write_bytes(obj_files(mesh)["mesh.obj"])
     loaded = trimesh.load_mesh(tmp_path / "mesh.obj", process=False)
     np.testing.assert_allclose(loaded.vertices, mesh.vertices, rtol=0, atol=tolerance(mesh))
     np.testing.assert_array_equal(loaded.faces, FACES)
@@ -80,6 +91,23 @@ def test_glb_is_read_back_and_stands_upright(tmp_path, mesh):
     loaded = upright_mesh(tmp_path / "mesh.glb")
     np.testing.assert_allclose(loaded.vertices, mesh.vertices @ upright.T, rtol=0, atol=tolerance(mesh))
     np.testing.assert_array_equal(loaded.faces, FACES)
+
+
+def test_shapes_for_printing_are_read_back(tmp_path, mesh):
+    """3MF as its specification says, without a library: trimesh asks for lxml."""
+    centre = (mesh.vertices.max(axis=0) + mesh.vertices.min(axis=0)) / 2 if np.abs(mesh.vertices).max() > 1e3 else 0.0
+    (tmp_path / "mesh.stl").write_bytes(stl_bytes(mesh))
+    stl = trimesh.load_mesh(tmp_path / "mesh.stl", process=False)
+    np.testing.assert_allclose(stl.triangles, (mesh.vertices - centre)[FACES], atol=1e-6)
+    (tmp_path / "mesh.3mf").write_bytes(threemf_bytes(mesh))
+    with zipfile.ZipFile(tmp_path / "mesh.3mf") as archive:
+        assert {"[Content_Types].xml", "_rels/.rels", "3D/3dmodel.model"} == set(archive.namelist())
+        model = ElementTree.fromstring(archive.read("3D/3dmodel.model"))
+    assert model.attrib["unit"] == "millimeter"
+    vertices = [[float(v.attrib[axis]) for axis in "xyz"] for v in model.iter() if v.tag.endswith("}vertex")]
+    faces = [[int(t.attrib[f"v{i}"]) for i in (1, 2, 3)] for t in model.iter() if t.tag.endswith("}triangle")]
+    np.testing.assert_allclose(vertices, mesh.vertices - centre, atol=1e-6)
+    assert faces == FACES.tolist()
 
 
 def test_up_becomes_plus_y():

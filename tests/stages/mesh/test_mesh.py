@@ -103,7 +103,7 @@ def run_mesh(tmp_path, progress, monkeypatch):
         info = {"rays": 1000, "effects": learnt or {}}
         write_json(inputs["train"] / "field.json", info)
         monkeypatch.setattr(extraction, "load_field", lambda *_: (model, info))
-        config = mesh.Config.model_validate({"resolution": 48} | settings)
+        config = mesh.Config.model_validate({"resolution": 48, "texture_size": 0} | settings)
         return run_stage(mesh, config, inputs, tmp_path / folder, progress), tmp_path / folder
 
     return run
@@ -123,7 +123,7 @@ def test_a_ball_becomes_a_closed_ball_in_the_sfm_frame(run_mesh, progress):
         assert 0 < abs(loaded.volume / (4 / 3 * np.pi * (radii.mean() / 0.25) ** 3) - 1) < 0.02
         expected = np.rint(255 * (0.5 + in_scene / 1.8))
         assert np.abs(colours_of(loaded) - expected).max() <= 255 * VOXEL / 1.8, "those of a grid cell away, at most"
-    assert any("surface at density" in note for note in progress.notes)
+    assert "mesh.iso-level" in progress.codes
     assert any("density at 48³ points" in message for message, _ in progress.updates)
 
 
@@ -305,7 +305,7 @@ def test_fog_becomes_a_mesh_that_says_it_is_fog(run_mesh, progress):
     result, _ = run_mesh(Solid(ball, inside=0.3))
     assert result.facts["faces"] > 100 and result.facts["surface_error_voxels"] is None
     assert result.line.endswith("; the field has no clear surface yet, train for longer")
-    assert any("still fog" in note for note in progress.notes)
+    assert progress.names("mesh.iso-level", "fog")
 
 
 def test_the_level_asked_for_is_taken(run_mesh):
@@ -320,3 +320,46 @@ def test_the_resolution_follows_the_training(tmp_path, progress, rays, resolutio
     write_json(tmp_path / "field.json", {"rays": rays})
     assert mesh.plan(mesh.Config(), {"train": tmp_path}, progress).resolution == resolution
     assert mesh.plan(mesh.Config(resolution=77), {"train": tmp_path}, progress).resolution == 77
+
+
+def test_faces_outside_of_the_box_are_left_out(run_mesh):
+    upper = (-1.0, -1.0, 0.0, 1.0, 1.0, 1.0)
+    result, folder = run_mesh(Solid(ball), box=upper, frame="scene")
+    vertices = np.asarray(trimesh.load_mesh(folder / "mesh.ply", process=False).vertices)
+    assert 0 <= vertices[:, 2].min() < VOXEL and abs(vertices[:, 2].max() - RADIUS) < VOXEL
+    assert result.facts["watertight"] is False
+    with refused("mesh.nothing-in-box", "0.4"):
+        run_mesh(Solid(ball), folder="beside", box=(0.8, 0.8, 0.8, 0.9, 0.9, 0.9), frame="scene")
+
+
+def test_closing_says_how_much_is_invented(run_mesh):
+    upper = (-1.0, -1.0, 0.0, 1.0, 1.0, 1.0)
+    result, folder = run_mesh(Solid(ball), box=upper, frame="scene", close=1.0, formats=("stl", "3mf", "ply"))
+    assert result.facts["watertight"] is True and result.facts["boundary"] == "watertight"
+    assert (result.facts["holes_closed"], result.facts["holes_left"]) == (1, 0)
+    assert result.facts["invented_area_share"] == pytest.approx(1 / 3, abs=0.03), "a disc, beside half a ball"
+    assert result.line.endswith("% of the area invented")
+    for name in ("mesh.stl", "mesh.ply"):
+        assert trimesh.load_mesh(folder / name).is_watertight
+    kept, _ = run_mesh(Solid(ball), folder="open", box=upper, frame="scene", close=0.1)
+    assert (kept.facts["holes_closed"], kept.facts["holes_left"]) == (0, 1)
+
+
+class Undefined(Solid):
+    """A field whose colours are not finite."""
+
+    def colour(self, points):
+        return super().colour(points) * math.nan
+
+
+def test_colours_that_are_not_finite_are_refused(run_mesh, tmp_path):
+    with refused("mesh.colours-not-finite", "NaN"):
+        run_mesh(Undefined(ball))
+    assert list((tmp_path / "mesh").iterdir()) == []
+
+
+def test_faces_follow_whether_there_is_a_texture(tmp_path, progress):
+    write_json(tmp_path / "field.json", {"rays": 1000})
+    for size, faces in ((4096, mesh.TEXTURED_FACES), (0, mesh.COLOURED_FACES)):
+        assert mesh.plan(mesh.Config(texture_size=size), {"train": tmp_path}, progress).max_faces == faces
+    assert mesh.plan(mesh.Config(max_faces=500), {"train": tmp_path}, progress).max_faces == 500

@@ -1,0 +1,121 @@
+"""The picture of a texture: every texel's colour from the photos that were chosen for its place on the surface.
+
+A texel shows what its best photo shows there, moved to what all photos agree on at the scale of the surface's edges:
+the difference is taken at the vertices, smoothed over the surface and linear within a face, so that neighbouring
+photos of different brightness meet without a seam (the global seam levelling of Lempitsky and Ivanov 2007, per photo
+and in closed form). Where photos take turns their weights change linearly across a face. Weights and differences
+belong to vertices, not to texels: the texture is continuous across the charts' borders.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import cv2
+import numpy as np
+import torch
+from scipy.sparse import csr_array
+
+from nerf.runtime.parallel import in_order
+from stages.mesh.rasteriser import barycentric, covered_pixels
+from stages.mesh.surface import Surface
+from stages.mesh.texture.atlas import Atlas
+from stages.mesh.texture.photos import Photo, colours_at, projected, read_picture
+from stages.mesh.texture.view_selection import Candidates, Choice
+
+LEVELLING_STEPS = 6  # over neighbours, of the differences between photos
+FACES_AT_ONCE = 1 << 14
+TEXELS_AT_ONCE = 1 << 22
+
+
+def bake(
+    surface: Surface,
+    atlas: Atlas,
+    photos: Sequence[Photo],
+    choice: Choice,
+    means: csr_array,
+    on_photo: Callable[[float], None],
+) -> np.ndarray:
+    """The texture, (height, width, 3) uint8 sRGB."""
+    light = np.zeros((atlas.height * atlas.width, 3), np.float16)
+    covered = np.zeros(atlas.height * atlas.width, bool)
+    given = np.zeros(len(surface.vertices))
+    for vertex, weight in choice.weights:
+        given[vertex] += weight
+    rest = (1 - given).clip(0)[:, None] * choice.colour
+    for face, texel, corner in _texels(atlas, np.arange(len(surface.faces))):
+        light[texel] = _within(corner, rest[surface.faces[face]])
+        covered[texel] = True
+
+    def part_of(index: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        return _part_of_photo(surface, atlas, photos[index], index, choice, means)
+
+    for index, part in enumerate(in_order(part_of, range(len(photos)), torch.device("cpu"))):
+        for texel, colour in part:
+            light[texel] += colour
+        on_photo((index + 1) / len(photos))
+    picture = np.empty((atlas.height * atlas.width, 3), np.uint8)
+    for start in range(0, len(picture), TEXELS_AT_ONCE):
+        some = slice(start, start + TEXELS_AT_ONCE)
+        picture[some] = np.rint(light[some].astype(np.float32) * 255).clip(0, 255)
+    del light
+    shape = (atlas.height, atlas.width)
+    return fill_gutters(picture.reshape(*shape, 3), covered.reshape(shape))
+
+
+def _part_of_photo(
+    surface: Surface, atlas: Atlas, photo: Photo, index: int, choice: Choice, means: csr_array
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """What a photo adds to the texture: texels, and colours (n, 3) float16 times what they weigh."""
+    weight = choice.weight(index)
+    faces = np.flatnonzero(weight[surface.faces].any(axis=1))
+    if len(faces) == 0:
+        return []
+    picture = read_picture(photo, max(1.0, 1 / atlas.texels_per_pixel))
+    level, part = _levelling(choice.candidates, index, choice.colour, means), []
+    of_vertex = np.concatenate([surface.vertices, level, weight[:, None]], axis=1)
+    for face, texel, corner in _texels(atlas, faces):
+        here = _within(corner, of_vertex[surface.faces[face]])
+        colour = colours_at(photo, picture, projected(photo, here[:, :3]).pixels, here[:, :3])
+        part.append((texel, ((colour + here[:, 3:6]).clip(0, 1) * here[:, 6:]).astype(np.float16)))
+    return part
+
+
+def _texels(atlas: Atlas, faces: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of some faces: the face of each texel, the texel's flat index and its barycentric coordinates, in blocks."""
+    for start in range(0, len(faces), FACES_AT_ONCE):
+        some = faces[start : start + FACES_AT_ONCE]
+        corners = atlas.uv[atlas.corner[some]]
+        for index, row, column in covered_pixels(corners, atlas.width, atlas.height):
+            at = np.stack([column, row], axis=1) + 0.5
+            yield some[index], row * atlas.width + column, barycentric(corners[index], at)
+
+
+def _within(corner: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (n, 3, channels) of three corners at barycentric coordinates (n, 3)."""
+    return (corner[:, None] @ values)[:, 0]
+
+
+def _levelling(candidates: Candidates, photo: int, colour: np.ndarray, means: csr_array) -> np.ndarray:
+    """What has to be added to a photo's colours at each vertex to agree with the others, (n, 3), smooth."""
+    vertex, slot = np.nonzero((candidates.photo == photo) & (candidates.quality > 0))
+    known, difference = np.zeros((len(colour), 1), np.float32), np.zeros_like(colour)
+    known[vertex] = 1
+    difference[vertex] = colour[vertex] - candidates.colour[vertex, slot]
+    for _ in range(LEVELLING_STEPS):
+        known, difference = means @ known, means @ difference
+    return np.divide(difference, known, out=np.zeros_like(difference), where=known > 0)
+
+
+def fill_gutters(picture: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """Give every texel outside of the charts the colour of the nearest one inside, so that filtering finds no black."""
+    if covered.all() or not covered.any():
+        return picture
+    _, nearest = cv2.distanceTransformWithLabels(
+        (~covered).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    # Labels count the covered texels, in an order that OpenCV does not promise: they are read at these texels.
+    label = np.asarray(nearest, np.int32).reshape(-1)
+    flat, inside, gaps = picture.reshape(-1, 3), np.flatnonzero(covered), np.flatnonzero(~covered)
+    source = np.empty(int(label.max()) + 1, np.int32)
+    source[label[inside]] = inside
+    flat[gaps] = flat[source[label[gaps]]]
+    return picture

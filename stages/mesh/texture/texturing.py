@@ -1,0 +1,62 @@
+"""The texture of a surface from the training photos: photos chosen, atlas laid out, picture baked."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nerf.geometry.scene import Scene
+from stages.hardware.memory import check_memory
+from stages.mesh.surface import Surface
+from stages.mesh.texture.atlas import Texture, make_atlas
+from stages.mesh.texture.baking import bake
+from stages.mesh.texture.photos import photos_of
+from stages.mesh.texture.view_selection import choose, find_candidates, neighbour_means
+
+# Colours as they add up and as bytes, and the nearest texel of each gap. Measured: 2.6 GB at 8192 × 8192.
+BYTES_PER_TEXEL = 32
+UNSEEN_DENSITY = 0.25  # texels per unit of length where no photo sees the surface, over the median where one does
+
+
+class Textured(NamedTuple):
+    """A texture, the share of the surface's vertices that no photo colours, and the share of (vertex, photo) that was
+    left out because the photo shows something else there."""
+
+    texture: Texture
+    unseen: float
+    outliers: float
+
+
+def texture_of(
+    surface: Surface,
+    field_colours: np.ndarray,
+    scene: Scene,
+    ingest: Path,
+    field: dict[str, Any],
+    voxel: float,
+    max_size: int,
+    report: Callable[[str, float], None],
+) -> Textured | None:
+    """The texture of a surface in the scene frame, at most ``max_size`` texels a side. ``field_colours`` (n, 3) sRGB
+    uint8 of the vertices hold where no photo sees them; ``field``: the content of field.json; ``voxel``: how well the
+    surface is known. None where no photo sees any of the surface. Raises StageError where that is too small, too large
+    for the memory, or a photo is gone."""
+    needed = BYTES_PER_TEXEL * max_size**2
+    hint = f"Try --mesh.texture-size {max_size // 2}."
+    check_memory(needed, "the texture", f"{max_size} × {max_size} texels need up to", hint)
+    photos, means = photos_of(scene, ingest, field), neighbour_means(surface)
+    candidates = find_candidates(
+        surface, photos, means, voxel, lambda done: report("choosing photos for the texture", 0.5 * done)
+    )
+    own = field_colours.astype(np.float32) / 255
+    choice = choose(candidates, own, surface.faces, means, len(photos))
+    best = np.sqrt(choice.candidates.quality.max(axis=1, initial=0))
+    seen = best > 0
+    if not seen.any():
+        return None
+    least = UNSEEN_DENSITY * float(np.median(best[seen]))
+    report("laying out the texture", 0.5)
+    atlas = make_atlas(surface, np.maximum(best, least)[surface.faces].max(axis=1), max_size)
+    picture = bake(surface, atlas, photos, choice, means, lambda done: report("baking the texture", 0.55 + 0.45 * done))
+    return Textured(Texture(atlas, picture), float(1 - seen.mean()), choice.outliers)

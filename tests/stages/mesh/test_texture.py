@@ -1,0 +1,290 @@
+"""Textures baked from photos of a surface whose colours are known, and what must not get into them."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from nerf.effects.exposure import expose
+from nerf.geometry.camera_paths import look_at
+from nerf.geometry.scene import Camera, Scene, Similarity, View
+from stages.io.files import write_png
+from stages.io.photos import Photo, write_photos
+from stages.mesh.files import ColouredMesh, glb_bytes, obj_files
+from stages.mesh.rasteriser import barycentric, covered_pixels
+from stages.mesh.surface import Surface, vertex_normals
+from stages.mesh.texture.atlas import make_atlas
+from stages.mesh.texture.baking import fill_gutters
+from stages.mesh.texture.charts import cut_into_charts
+from stages.mesh.texture.photos import sampled_picture
+from stages.mesh.texture.texturing import texture_of
+from tests.refusals import refused
+
+SIDE, FOCAL = 160, 200.0
+CAMERA = Camera("PINHOLE", SIDE, SIDE, (FOCAL, FOCAL, SIDE / 2, SIDE / 2))
+GREY = 128
+
+
+def pattern(points):
+    """Colours (n, 3) in [0.2, 0.8], with detail finer than the surface's edges."""
+    x, y = points[:, 0], points[:, 1]
+    waves = np.stack([np.sin(40 * x), np.sin(35 * y), np.sin(30 * (x + y))], axis=1)
+    return 0.5 + 0.15 * waves + 0.15 * np.stack([x, y, -x], axis=1)
+
+
+def sheet(cells=16, half=0.8):
+    """The square [-half, half]² at z = 0, seen from above."""
+    line = np.linspace(-half, half, cells + 1)
+    x, y = np.meshgrid(line, line, indexing="ij")
+    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
+    a, b, c, d = (part.reshape(-1) for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return Surface(np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3), faces.astype(np.int32))
+
+
+def views(count=6):
+    poses = []
+    for number in range(count):
+        angle = 2 * math.pi * number / count
+        centre = np.array([0.5 * math.cos(angle), 0.5 * math.sin(angle), 2.0])
+        poses.append(look_at(centre[None], np.zeros(3), np.array([0.0, 1, 0]))[0])
+    return tuple(View(f"{i}.png", f"images/{i}.png", 0, pose, 0.1, 9.0, "train") for i, pose in enumerate(poses))
+
+
+def scene_of(some):
+    return Scene((CAMERA,), some, Similarity(1.0, np.eye(3), np.zeros(3)), True, False, "forward-facing", True)
+
+
+def seen_points(view):
+    """Where the rays of a photo meet the plane z = 0, (pixels, 3)."""
+    at = (np.arange(SIDE) + 0.5 - SIDE / 2) / FOCAL
+    x, y = np.meshgrid(at, at)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ view.scene_from_camera[:, :3].T
+    centre = view.scene_from_camera[:, 3]
+    return centre - rays * (centre[2] / rays[:, 2:])
+
+
+@pytest.fixture
+def shoot(tmp_path):
+    """Write photos of the plane: ``change(index, colours, points)`` may alter what one shows; the scene of them."""
+
+    def write(change=lambda index, colours, points: colours, some=None, masks=()):
+        taken, photos = some or views(), []
+        for index, view in enumerate(taken):
+            points = seen_points(view)
+            colours = change(index, pattern(points), points)
+            pixels = np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8).reshape(SIDE, SIDE, 3)
+            write_png(tmp_path / view.file, pixels)
+            photos.append(Photo(view.name, view.file, SIDE, SIDE, 0, None, None, False, 1.0))
+        for index, mask in masks:
+            write_png(tmp_path / f"masks/{index}.png", mask)
+            taken = (*taken[:index], replace(taken[index], mask=f"masks/{index}.png"), *taken[index + 1 :])
+        write_photos(tmp_path, photos, [], {})
+        return scene_of(taken)
+
+    return write
+
+
+@pytest.fixture
+def baked(tmp_path):
+    """The texture of a surface, as (points, colours) of its texels, and what texture_of gives."""
+
+    def bake(surface, scene, effects=None, size=512):
+        grey = np.full((len(surface.vertices), 3), GREY, np.uint8)
+        field = {"effects": effects or {}}
+        found = texture_of(surface, grey, scene, tmp_path, field, 0.05, size, lambda what, done: None)
+        assert found is not None
+        atlas, picture = found.texture
+        blocks = list(covered_pixels(atlas.uv[atlas.corner], atlas.width, atlas.height))
+        face, row, column = (np.concatenate(part) for part in zip(*blocks, strict=True))
+        at = np.stack([column, row], axis=1) + 0.5
+        points = (barycentric(atlas.uv[atlas.corner[face]], at)[:, None] @ surface.vertices[surface.faces[face]])[:, 0]
+        return points, picture[row, column] / 255, found
+
+    return bake
+
+
+def error(points, colours, expected=None):
+    """Mean absolute error away from the borders, which no photo may show whole."""
+    inside = (np.abs(points[:, :2]) < 0.6).all(axis=1)
+    assert inside.sum() > 1000
+    return np.abs(colours - (pattern(points) if expected is None else expected))[inside].mean()
+
+
+def test_the_texture_shows_what_the_photos_show(shoot, baked):
+    points, colours, found = baked(sheet(), shoot())
+    assert 0 < error(points, colours) < 0.015
+    assert 0.8 < found.texture.atlas.texels_per_pixel <= 1 and found.outliers < 0.01
+    coarse = np.full_like(colours, 0.5)
+    assert error(points, coarse) > 0.1, "the pattern is no grey"
+
+
+def test_exposure_is_undone_before_photos_are_blended(shoot, baked):
+    gains = [0.0, -0.9, 0.0, -0.8, 0.1, -0.9]
+    taken = shoot(lambda index, colours, _: expose(torch.tensor(colours), torch.full((1, 3), gains[index])).numpy())
+    learnt = {"exposure": {f"{index}.png": [gain] * 3 for index, gain in enumerate(gains)}}
+    points, colours, _ = baked(sheet(), taken, learnt)
+    reference = torch.full((1, 3), sorted(gains)[2])  # torch's median of an even number is the lower one
+    assert 0 < error(points, colours, expose(torch.tensor(pattern(points)), reference).numpy()) < 0.015
+    points, colours, _ = baked(sheet(), taken)
+    assert error(points, colours, expose(torch.tensor(pattern(points)), reference).numpy()) > 0.02
+
+
+def test_a_passer_by_leaves_no_ghost(shoot, baked):
+    def blocked(index, colours, points):
+        there = np.linalg.norm(points[:, :2] - [0.1, 0.1], axis=1) < 0.25
+        return np.where((index == 2) & there[:, None], [0.9, 0.05, 0.9], colours)
+
+    points, colours, found = baked(sheet(), shoot(blocked))
+    near = np.linalg.norm(points[:, :2] - [0.1, 0.1], axis=1) < 0.3
+    wrong = np.abs(colours - pattern(points)).max(axis=1)[near] > 0.2
+    assert found.outliers > 0.01 and wrong.mean() < 0.01
+    clean = baked(sheet(), shoot())
+    assert error(points, colours) < error(*clean[:2]) + 0.005
+
+
+def test_masked_pixels_are_never_used(shoot, baked):
+    """A photo that shows nothing else counts nowhere but where its mask lets it, alone as it is."""
+    mask = np.full((SIDE, SIDE), 255, np.uint8)
+    mask[:, : SIDE // 2] = 0
+    magenta = [1.0, 0, 1]
+
+    def left_is_magenta(index, colours, points):
+        left = np.tile(np.arange(SIDE) < SIDE // 2, SIDE)
+        return np.where(left[:, None], magenta, colours)
+
+    _, colours, found = baked(sheet(), shoot(left_is_magenta, views(1), [(0, mask)]))
+    assert 0.3 < found.unseen < 0.7
+    assert (np.abs(colours - magenta).max(axis=1) > 0.2).all()
+    unmasked = baked(sheet(), shoot(left_is_magenta, views(1)))[1]
+    assert (np.abs(unmasked - magenta).max(axis=1) < 0.1).mean() > 0.2
+
+
+def test_what_lies_behind_gets_nothing_of_what_hides_it(shoot, baked):
+    """A red plate above the sheet; photos from all sides see what each other cannot."""
+    plate = sheet(4, 0.15)
+    plate = Surface(plate.vertices + np.array([0, 0, 0.5]), plate.faces)
+    both = Surface(
+        np.concatenate([sheet().vertices, plate.vertices]),
+        np.concatenate([sheet().faces, plate.faces + len(sheet().vertices)]),
+    )
+    taken = views()
+
+    def with_plate(index, colours, points):
+        centre = taken[index].scene_from_camera[:, 3]
+        at_plate = points + (centre - points) * (0.5 / centre[2])
+        return np.where((np.abs(at_plate[:, :2]) < 0.15).all(axis=1)[:, None], [1.0, 0, 0], colours)
+
+    points, colours, _ = baked(both, shoot(with_plate))
+    low = points[:, 2] < 0.1
+    red = np.abs(colours - [1.0, 0, 0]).max(axis=1) < 0.3
+    assert red[~low].mean() > 0.9 and red[low].mean() < 0.002
+
+
+def bumps():
+    """A surface that takes many charts."""
+    flat = sheet(40)
+    x, y = flat.vertices[:, 0], flat.vertices[:, 1]
+    return Surface(flat.vertices + np.stack([0 * x, 0 * x, 0.12 * np.sin(9 * x) * np.sin(9 * y)], axis=1), flat.faces)
+
+
+def test_charts_meet_in_the_same_colours(shoot, baked):
+    surface = bumps()
+    _, _, found = baked(surface, shoot())
+    atlas, picture = found.texture
+    assert len(atlas.uv) > len(surface.vertices) + 50
+    shown = sampled_picture(picture, atlas.uv).astype(float)
+    count = np.bincount(atlas.vertex)
+    spread = np.zeros(len(count))
+    for vertex in np.flatnonzero(count > 1):
+        spread[vertex] = np.ptp(shown[atlas.vertex == vertex], axis=0).max()
+    assert np.median(spread[count > 1]) < 15 and (spread[count > 1] < 45).mean() > 0.95
+
+
+def test_charts_hold_each_face_once_and_do_not_overlap():
+    surface = bumps()
+    charts = cut_into_charts(surface)
+    assert charts.chart.shape == (len(surface.faces),) and 1 < charts.chart.max() + 1 < 200
+    atlas = make_atlas(surface, np.full(len(surface.faces), 100.0), 1024)
+    hits = np.zeros(atlas.width * atlas.height, int)
+    for _, row, column in covered_pixels(atlas.uv[atlas.corner], atlas.width, atlas.height):
+        np.add.at(hits, row * atlas.width + column, 1)
+    assert (hits > 1).sum() < 1e-3 * hits.sum() and hits.sum() > 10_000
+    np.testing.assert_array_equal(atlas.vertex[atlas.corner], surface.faces)
+
+
+def test_a_surface_folded_over_itself_is_cut(shoot):
+    """A spiral stair looks up everywhere, and its turns lie over each other."""
+    turn = np.linspace(0, 6 * math.pi, 120)
+    rim = np.stack([np.cos(turn), np.sin(turn), 0.05 * turn], axis=1)
+    vertices = np.concatenate([0.3 * rim + [0, 0, 1] * rim * 0.7, rim])
+    low = np.arange(119)
+    faces = np.concatenate([np.stack([low, low + 120, low + 121], 1), np.stack([low, low + 121, low + 1], 1)])
+    atlas = make_atlas(Surface(vertices, faces.astype(np.int32)), np.full(len(faces), 60.0), 1024)
+    hits = np.zeros(atlas.width * atlas.height, int)
+    for _, row, column in covered_pixels(atlas.uv[atlas.corner], atlas.width, atlas.height):
+        np.add.at(hits, row * atlas.width + column, 1)
+    assert 0 <= (hits > 1).sum() < 0.01 * hits.sum()
+
+
+def test_a_single_face_and_one_without_area_have_texels(shoot, baked):
+    corner = Surface(
+        np.array([[-0.4, -0.4, 0], [0.4, -0.4, 0], [0, 0.4, 0], [0.8, -0.4, 0]]), np.array([[0, 1, 2]], np.int32)
+    )
+    _, colours, found = baked(corner, shoot())
+    assert len(colours) > 100 and found.unseen <= 0.25
+    line = corner._replace(faces=np.array([[0, 1, 2], [0, 1, 3]], np.int32))
+    assert len(baked(line, shoot())[1]) > 100
+
+
+def test_a_texture_of_one_texel_is_refused(shoot, baked):
+    with refused("mesh.texture-too-small", "1"):
+        baked(bumps(), shoot(), size=1)
+
+
+def test_a_photo_that_is_gone_is_named(shoot, baked, tmp_path):
+    scene = shoot()
+    (tmp_path / "images/3.png").unlink()
+    with refused("mesh.photo-unreadable", "3.png"):
+        baked(sheet(), scene)
+
+
+def test_a_surface_that_no_photo_sees_has_no_texture(shoot, tmp_path):
+    turned = sheet()._replace(faces=sheet().faces[:, ::-1])
+    grey = np.full((len(turned.vertices), 3), GREY, np.uint8)
+    assert texture_of(turned, grey, shoot(), tmp_path, {"effects": {}}, 0.05, 64, lambda what, done: None) is None
+
+
+def test_gutters_repeat_the_nearest_texel():
+    picture, covered = np.zeros((8, 9, 3), np.uint8), np.zeros((8, 9), bool)
+    covered[2, 1], covered[6, 7] = True, True
+    picture[2, 1], picture[6, 7] = 50, 200
+    filled = fill_gutters(picture, covered)
+    assert filled[0, 0].tolist() == [50] * 3 and filled[7, 8].tolist() == [200] * 3 and filled[2, 1, 0] == 50
+    assert set(np.unique(filled)) == {50, 200}
+
+
+def test_files_hold_the_texture_the_right_way_up(shoot, baked, tmp_path):
+    surface = sheet(8)
+    _, _, found = baked(surface, shoot())
+    colours = np.zeros_like(surface.vertices, dtype=np.uint8)
+    mesh = ColouredMesh(*surface, vertex_normals(surface), colours, found.texture)
+    for name, content in (obj_files(mesh) | {"mesh.glb": glb_bytes(mesh, np.eye(3))}).items():
+        (tmp_path / name).write_bytes(content)
+    for name in ("mesh.obj", "mesh.glb"):
+        loaded = trimesh.load_scene(tmp_path / name, process=False).to_geometry()
+        assert isinstance(loaded, trimesh.Trimesh)
+        visual = loaded.visual
+        assert isinstance(visual, TextureVisuals)
+        material = visual.material
+        picture = material.baseColorTexture if isinstance(material, PBRMaterial) else material.image
+        picture = np.ascontiguousarray(np.asarray(picture)[..., :3])
+        at = np.asarray(visual.uv) * [picture.shape[1], -picture.shape[0]] + [0, picture.shape[0]]
+        inner = (np.abs(np.asarray(loaded.vertices)[:, :2]) < 0.6).all(axis=1)
+        difference = sampled_picture(picture, at)[inner] / 255 - pattern(np.asarray(loaded.vertices)[inner])
+        assert inner.sum() > 20 and np.abs(difference).mean() < 0.03
