@@ -224,11 +224,16 @@ SpaceMap = Box | Contraction | Ndc
 
 
 def space_map(kind: str, **parameters: Any) -> SpaceMap:
-    """A map by its kind and parameters, as ``dataclasses.asdict`` gives them. Raises ValueError for an unknown kind."""
+    """A map by its kind and parameters, as ``dataclasses.asdict`` gives them, or JSON, which has lists for tuples.
+    Raises ValueError for an unknown kind."""
     maps = {"box": Box, "contraction": Contraction, "ndc": Ndc}
     if kind not in maps:
         raise ValueError(f"the space map is {kind!r}; it must be one of {', '.join(maps)}")
-    return maps[kind](**parameters)
+    return maps[kind](**{name: _tuples(value) for name, value in parameters.items()})
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def enclosing_ndc(

@@ -255,7 +255,7 @@ def _outputs(workspace: Workspace) -> dict[str, Path]:
 
 def _closing_words(workspace: Workspace, ran: bool) -> str:
     found = _outputs(workspace)
-    named = [str(found[name]) for name in ("report.html", "mesh.glb", "video.mp4") if name in found]
+    named = [str(found[name]) for name in ("report.html", "viewer.html", "mesh.glb", "video.mp4") if name in found]
     words = "" if ran else "nothing to do: everything is up to date "
     return words + ("→ " + "  ".join(named) if named else f"→ {workspace.root}")
 

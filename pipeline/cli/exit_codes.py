@@ -1,4 +1,4 @@
-"""How a command ends, as a number: 0 done; 1 a bug in this program; 2 usage; 3 the workspace; 10 to 20 the stage
+"""How a command ends, as a number: 0 done; 1 a bug in this program; 2 usage; 3 the workspace; 10 to 21 the stage
 that failed, by what it declares; 130 Ctrl-C; 143 SIGTERM."""
 
 from pipeline.engine.stage_list import STAGES

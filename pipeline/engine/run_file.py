@@ -15,7 +15,7 @@ from stages.io.files import first_fault, write_durably
 
 NAME = "run.json"
 VERSION = 2
-PATHS = ("photos", "cameras")  # options of stages that are paths
+PATHS = {"ingest": ("photos", "cameras"), "sfm": ("cameras",), "render": ("cameras",)}  # options that are paths
 
 Options = dict[str, dict[str, Any]]
 
@@ -78,6 +78,7 @@ def portable(options: Options, root: Path) -> Options:
 def _with_paths(options: Mapping[str, dict[str, Any]], change: Callable[[str], str]) -> Options:
     """Options by stage, with their paths changed."""
     return {
-        stage: values | {name: change(path) for name in PATHS if isinstance(path := values.get(name), str)}
+        stage: values
+        | {name: change(path) for name in PATHS.get(stage, ()) if isinstance(path := values.get(name), str)}
         for stage, values in options.items()
     }

@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 
-from stages import depth, effects, evaluate, ingest, mesh, normalise, render, report, sfm, tradeoff, train
+from stages import depth, effects, evaluate, ingest, mesh, normalise, render, report, sfm, tradeoff, train, viewer
 from stages.contract import StageConfig, declared, inputs_of
 
 STAGES: dict[str, ModuleType] = {
     module.__name__.rpartition(".")[2]: module
-    for module in (ingest, sfm, normalise, depth, effects, train, evaluate, render, mesh, tradeoff, report)
+    for module in (ingest, sfm, normalise, depth, effects, train, evaluate, render, viewer, mesh, tradeoff, report)
 }
 
 SOURCE = next(iter(STAGES))

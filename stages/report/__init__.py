@@ -13,8 +13,8 @@ from tyro.conf import Suppress
 from stages.contract import READING_SECONDS, Inputs, Progress, StageConfig, StageResult, Workload
 from stages.io.files import write_json
 
-INPUTS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "tradeoff")
-VERSION = 11
+INPUTS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "viewer", "mesh", "tradeoff")
+VERSION = 13
 EXIT_CODE = 18
 RESUMES = False
 SUMMARY = True

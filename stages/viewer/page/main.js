@@ -1,0 +1,226 @@
+// The viewer: what is shown, and how its parts hang together. Its public functions are what tests call, too.
+
+const SAVE_LINK_MS = 400; // without a move until the address holds the view
+const BACKGROUNDS = { white: [1, 1, 1], black: [0, 0, 0] };
+
+class Viewer {
+  constructor(canvas, contents) {
+    Object.assign(this, { canvas, contents, view: "colour", background: "trained", stops: 0, photo: null, crop: null });
+    Object.assign(this, { measured: [], isMeasuring: false, path: new CameraPath(), lens: lensOf(contents.scene.lens) });
+    this.training = contents.views.filter((view) => view.split === "train");
+    this.navigation = new Navigation(canvas, contents.scene.up, (kind) => this.moved(kind), (x, y) => this.clicked(x, y));
+    this.navigation.pose = this.home();
+    this.overlay = new Overlay(contents);
+    this.renderer = new Renderer(canvas, contents, () => this.request(), (request) => this.drawOver(request));
+    this.overlay.restore(this.renderer.graphics);
+    this.readLink();
+    this.panels = new Panels(this);
+    canvas.addEventListener("webglcontextlost", (event) => {
+      event.preventDefault();
+      this.panels.say("The graphics chip was taken away; waiting for it …");
+    });
+    canvas.addEventListener("webglcontextrestored", () => {
+      this.renderer.restore();
+      this.overlay.restore(this.renderer.graphics);
+      this.panels.say("");
+    });
+    canvas.addEventListener("dblclick", (event) => this.orbitAround(event));
+    window.addEventListener("hashchange", () => this.readLink());
+    if (!this.linked) this.navigation.distance = this.distanceAhead();
+    this.homeDistance = this.navigation.distance;
+    requestAnimationFrame((time) => this.frame(time, time));
+  }
+
+  /** A training camera: of those that face one way the one in the middle, else the one of median elevation. */
+  home() {
+    const { scene } = this.contents, poses = this.training.map((view) => view.pose);
+    const middle = scaled(poses.reduce((sum, pose) => add(sum, pose.centre), [0, 0, 0]), 1 / poses.length);
+    const aside = (pose) => norm(subtract(pose.centre, middle)), elevation = (pose) => dot(forward(pose), scene.up);
+    const by = scene.forward_facing ? aside : elevation;
+    const ordered = poses.sort((a, b) => by(a) - by(b));
+    return ordered[scene.forward_facing ? 0 : ordered.length >> 1];
+  }
+
+  distanceAhead() {
+    const lens = fitted(this.lens, this.canvas.width, this.canvas.height);
+    return this.renderer.distanceAt(lens.width / 2, lens.height / 2) ?? Math.max(0.5, norm(this.navigation.pose.centre));
+  }
+
+  request() {
+    const { field, scene, views } = this.contents, { pose } = this.navigation;
+    const photo = this.photo === null ? null : views[this.photo], shown = photo ?? field;
+    return {
+      pose,
+      lens: this.lens,
+      view: this.view,
+      nearFar: photo ? photo.nearFar : nearFarBetween(pose, this.training, scene.bounded),
+      background: BACKGROUNDS[this.background] ?? field.background,
+      logGain: shown.log_gain.map((gain) => gain + this.stops * Math.LN2),
+      falloff: shown.falloff,
+      crop: this.crop,
+    };
+  }
+
+  frame(time, before) {
+    this.navigation.frame(Math.min(0.1, (time - before) / 1000));
+    this.renderer.frame();
+    if (this.moveTime && now() - this.moveTime > SAVE_LINK_MS) this.writeLink();
+    requestAnimationFrame((next) => this.frame(next, time));
+  }
+
+  /** Some part of what is shown was changed. */
+  changed() {
+    this.renderer.touch();
+    this.panels?.update();
+  }
+
+  moved(kind) {
+    if (!kind && this.photo !== null) this.photo = null;
+    if (!kind) this.playing = false;
+    this.moveTime = now();
+    this.renderer?.touch();
+    this.panels?.update();
+  }
+
+  drawOver(request) {
+    const extras = [];
+    if (this.crop) extras.push(...boxLines(this.crop, COLOURS.crop));
+    if (this.measured.length === 2) extras.push([...this.measured, COLOURS.measure]);
+    const { keys } = this.path;
+    keys.slice(1).forEach((key, i) => extras.push([keys[i].centre, key.centre, COLOURS.path]));
+    this.overlay.draw(request, extras, this.photo);
+    this.panels?.place(request);
+  }
+
+  // --- photos
+
+  async showPhoto(index) {
+    const view = this.contents.views[index];
+    this.lens = view.lens;
+    this.photo = null;
+    const distance = this.navigation.distance;
+    await this.navigation.flyTo(view.pose, distance);
+    this.photo = index;
+    this.changed();
+  }
+
+  leavePhoto() {
+    this.photo = null;
+    this.changed();
+  }
+
+  reset() {
+    this.lens = lensOf(this.contents.scene.lens);
+    this.photo = null;
+    return this.navigation.flyTo(this.home(), this.homeDistance);
+  }
+
+  // --- clicks: cameras, points to measure, points to orbit around
+
+  clicked(x, y) {
+    if (this.isMeasuring) return this.measure(x, y);
+    if (!this.overlay.layers.cameras) return;
+    const lens = fitted(this.lens, this.canvas.width, this.canvas.height), reach = 24 * (window.devicePixelRatio || 1);
+    let nearest = null;
+    this.contents.views.forEach((view, index) => {
+      for (const point of [view.pose.centre, ...this.overlay.frustum(view)]) {
+        const at = projected(this.navigation.pose, lens, point), away = Math.hypot(at.x - x, at.y - y);
+        if (at.depth > 0 && away < reach && (!nearest || away < nearest.away)) nearest = { index, away };
+      }
+    });
+    if (nearest) return this.showPhoto(nearest.index);
+  }
+
+  /** The point of the scene that a pixel of the canvas shows; null in empty space. */
+  pointAt(x, y) {
+    const distance = this.renderer.distanceAt(x, y), lens = fitted(this.lens, this.canvas.width, this.canvas.height);
+    if (distance === null) return null;
+    const { pose } = this.navigation;
+    return add(pose.centre, scaled(pixelDirection(pose, lens, x, y), distance));
+  }
+
+  measure(x, y) {
+    const point = this.pointAt(x, y);
+    if (!point) return this.panels.say("There is nothing at this place.", true);
+    this.measured = this.measured.length === 1 ? [this.measured[0], point] : [point];
+    this.changed();
+  }
+
+  /** {value, unit} between the two measured points. */
+  distance() {
+    if (this.measured.length < 2) return null;
+    const length = norm(subtract(...this.measured)), metres = this.contents.scene.metres_per_unit;
+    return metres ? { value: length * metres, unit: "m" } : { value: length, unit: "scene units" };
+  }
+
+  orbitAround(event) {
+    const box = this.canvas.getBoundingClientRect(), ratio = this.canvas.width / box.width;
+    const point = this.pointAt((event.clientX - box.left) * ratio, (event.clientY - box.top) * ratio);
+    if (!point || this.isMeasuring) return;
+    const { pose } = this.navigation, depth = dot(subtract(point, pose.centre), forward(pose));
+    this.photo = null;
+    const aside = subtract(subtract(point, pose.centre), scaled(forward(pose), depth));
+    this.navigation.flyTo({ ...pose, centre: add(pose.centre, aside) }, depth);
+  }
+
+  // --- camera path
+
+  pathJson(secondsPerKey) {
+    return this.path.json(this.lens, this.contents.scene.sfm_from_scene, secondsPerKey);
+  }
+
+  async play(secondsPerKey) {
+    this.playing = true;
+    const frames = this.path.frames(secondsPerKey), began = now();
+    for (let index = 0; this.playing && index < frames.length; index = Math.floor(((now() - began) / 1000) * FPS)) {
+      this.navigation.pose = frames[index];
+      this.moved("playing");
+      await new Promise(requestAnimationFrame);
+    }
+    if (this.playing && frames.length) this.navigation.moveTo(frames[frames.length - 1]);
+  }
+
+  // --- the address holds the view
+
+  writeLink() {
+    this.moveTime = null;
+    const { pose, distance } = this.navigation, digits = (values) => values.map((x) => x.toPrecision(7)).join(",");
+    const link = `#c=${digits(pose.centre)}&q=${digits(quaternion(pose.rotation))}&d=${digits([distance])}&v=${this.view}`;
+    try {
+      history.replaceState(null, "", link);
+    } catch {
+      // A browser that gives files no address has no link; everything else works.
+    }
+  }
+
+  readLink() {
+    const values = new URLSearchParams(location.hash.slice(1)), numbers = (name) => (values.get(name) ?? "").split(",").map(Number);
+    const [centre, turn, [distance]] = [numbers("c"), numbers("q"), numbers("d")];
+    const isWhole = centre.length === 3 && turn.length === 4 && [...centre, ...turn, distance].every(Number.isFinite);
+    if (!isWhole || !(norm(turn) > 0) || !(distance > 0)) return;
+    this.linked = true;
+    this.photo = null;
+    this.navigation.distance = distance;
+    if (values.get("v") in VIEWS) this.view = values.get("v");
+    this.navigation.moveTo({ centre, rotation: rotationOf(unit(turn)) });
+  }
+}
+
+async function start() {
+  const canvas = document.getElementById("canvas"), message = document.getElementById("message");
+  const cannot = (why) => (message.textContent = why);
+  if (!window.WebGL2RenderingContext) return cannot("This browser has no WebGL 2, with which the scene is drawn. Any current Chrome, Firefox or Safari has it.");
+  if (!window.DecompressionStream) return cannot("This browser is too old to unpack the scene. Chrome 80, Firefox 113, Safari 16.4 and later can.");
+  try {
+    const contents = await unpacked(document.getElementById("payload").textContent);
+    message.textContent = "Preparing the graphics chip …";
+    await new Promise((resume) => setTimeout(resume, 30));
+    window.viewer = new Viewer(canvas, contents);
+    message.textContent = "";
+  } catch (error) {
+    cannot(error.message === "no WebGL2"
+      ? "WebGL 2 is turned off in this browser or not supported by its graphics driver; the scene is drawn with it."
+      : `The scene cannot be drawn here: ${error.message}`);
+    throw error;
+  }
+}

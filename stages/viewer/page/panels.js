@@ -1,0 +1,252 @@
+// The controls beside the picture. Text from files goes in as text, never as HTML.
+
+const byId = (id) => document.getElementById(id);
+const SAID_MS = 2500;
+
+class Panels {
+  constructor(viewer) {
+    this.viewer = viewer;
+    const { field, exposure, scene } = viewer.contents;
+    byId("exposure-row").hidden = !exposure;
+    byId("background-row").hidden = field.background_levels.length > 0 || !scene.has_alpha;
+    this.menu();
+    this.shown();
+    this.layers();
+    this.photos();
+    this.measuring();
+    this.cropping();
+    this.path();
+    this.about();
+    viewer.canvas.addEventListener("keydown", (event) => this.keyed(event));
+    this.update();
+  }
+
+  on(id, name, act) {
+    byId(id).addEventListener(name, act);
+  }
+
+  menu() {
+    const panel = byId("panel"), toggle = (open) => {
+      panel.hidden = !open;
+      byId("menu").setAttribute("aria-expanded", String(open));
+    };
+    this.on("menu", "click", () => toggle(panel.hidden));
+    toggle(window.innerWidth > 640);
+  }
+
+  shown() {
+    const { viewer } = this;
+    for (const input of document.getElementsByName("view")) {
+      input.addEventListener("change", () => {
+        viewer.view = input.value;
+        viewer.moved("view");
+      });
+    }
+    this.on("background", "change", (event) => {
+      viewer.background = event.target.value;
+      viewer.changed();
+    });
+    this.on("exposure", "input", (event) => {
+      viewer.stops = Number(event.target.value);
+      byId("exposure-value").textContent = `${viewer.stops > 0 ? "+" : ""}${viewer.stops} EV`;
+      viewer.changed();
+    });
+    this.on("reset", "click", () => viewer.reset());
+    this.on("level", "click", () => viewer.navigation.level());
+    this.on("screenshot", "click", () => this.screenshot());
+    this.on("link", "click", async () => {
+      viewer.writeLink();
+      await navigator.clipboard?.writeText(location.href).then(() => this.say("Copied.", true), () => this.say("The address bar has the link.", true));
+    });
+  }
+
+  layers() {
+    const { viewer } = this;
+    for (const name of ["cameras", "points", "axes"]) {
+      this.on(`layer-${name}`, "change", (event) => {
+        viewer.overlay.layers[name] = event.target.checked;
+        viewer.renderer.showAgain();
+      });
+    }
+  }
+
+  photos() {
+    const { viewer } = this, { views, section } = viewer.contents, list = byId("views");
+    for (const split of ["train", "test"]) {
+      const group = document.createElement("optgroup");
+      group.label = split === "test" ? "held out" : "trained on";
+      views.forEach((view, index) => {
+        if ((view.split === "test") !== (split === "test")) return;
+        const option = document.createElement("option");
+        [option.value, option.textContent] = [index, view.name];
+        group.append(option);
+      });
+      if (group.children.length) list.append(group);
+    }
+    list.addEventListener("change", () => list.value !== "" && viewer.showPhoto(Number(list.value)));
+    byId("photos-note").textContent = section("photo0") ? "" : "This file contains no photos.";
+    const step = (by) => viewer.showPhoto((viewer.photo + by + views.length) % views.length);
+    this.on("photo-before", "click", () => step(-1));
+    this.on("photo-after", "click", () => step(1));
+    this.on("photo-close", "click", () => viewer.leavePhoto());
+    this.on("photo-share", "input", () => this.update());
+  }
+
+  measuring() {
+    const { viewer } = this;
+    this.on("measure", "toggle", (event) => {
+      viewer.isMeasuring = event.target.open;
+      viewer.canvas.classList.toggle("measuring", viewer.isMeasuring);
+    });
+    this.on("measure-clear", "click", () => {
+      viewer.measured = [];
+      viewer.changed();
+    });
+  }
+
+  cropping() {
+    const { viewer } = this, extent = viewer.contents.scene.bounded ? 0.9 : 2, bounds = {};
+    const apply = () => {
+      const side = (name) => [0, 1, 2].map((axis) => Number(bounds[`${axis}${name}`].value));
+      viewer.crop = byId("crop-on").checked ? { low: side("low"), high: side("high") } : null;
+      viewer.changed();
+    };
+    ["x", "y", "z"].forEach((axis, index) => {
+      for (const [name, value] of [["low", -extent], ["high", extent]]) {
+        const label = document.createElement("label"), input = document.createElement("input");
+        Object.assign(input, { type: "range", min: -extent, max: extent, step: extent / 100, value });
+        input.addEventListener("input", () => {
+          const other = bounds[`${index}${name === "low" ? "high" : "low"}`];
+          const gap = extent / 50, limit = Number(other.value);
+          input.value = name === "low" ? Math.min(input.value, limit - gap) : Math.max(input.value, limit + gap);
+          byId("crop-on").checked = true;
+          apply();
+        });
+        bounds[`${index}${name}`] = input;
+        label.append(`${axis} ${name === "low" ? "from" : "to"} `, input);
+        byId("crop-sliders").append(label);
+      }
+    });
+    this.on("crop-on", "change", apply);
+  }
+
+  path() {
+    const { viewer } = this, seconds = () => clamp(Number(byId("path-seconds").value) || 2, 0.1, 60);
+    this.on("path-add", "click", () => {
+      viewer.path.keys.push(viewer.navigation.pose);
+      viewer.changed();
+    });
+    this.on("path-remove", "click", () => {
+      viewer.path.keys.pop();
+      viewer.changed();
+    });
+    this.on("path-play", "click", () => viewer.play(seconds()));
+    this.on("path-save", "click", () => {
+      const text = JSON.stringify(viewer.pathJson(seconds()), null, 1);
+      save(new Blob([text], { type: "application/json" }), "path.json");
+    });
+  }
+
+  about() {
+    const { field, comparison, appearance, scene, sections } = this.viewer.contents, list = byId("about");
+    const rows = field.levels.reduce((sum, level) => sum + level.rows, 0);
+    const bytes = byId("payload").textContent.length;
+    const facts = {
+      Field: `${field.levels.length} hash grids, ${(rows / 1e6).toFixed(2)} million rows of 4 features, up to ${field.levels.at(-1).resolution} cells a side`,
+      Space: { box: "a box", contraction: "all of space, contracted", ndc: "normalised device coordinates" }[field.space.kind],
+      Numbers: `${field.bits} bits each; ${(bytes / (4 * rows)).toFixed(2)} bytes of this file per number`,
+      "Loss by packing": `${(comparison.trained_db - comparison.packed_db).toFixed(3)} dB: ${comparison.packed_db.toFixed(2)} instead of `
+        + `${comparison.trained_db.toFixed(2)} dB on ${comparison.views} reduced photos`,
+      "Work of a pixel": `${field.levels.length * 8} table reads at each sample on its ray`,
+      Appearance: appearance ?? "as the photos show it",
+      Scale: scene.metres_per_unit ? `a scene unit is ${scene.metres_per_unit.toPrecision(4)} m (by GPS)` : "unknown: lengths are in scene units",
+      Photos: sections.photo0 ? `${this.viewer.contents.views.length} small copies are in this file` : "none are in this file",
+      Network: "this file never uses any",
+    };
+    for (const [name, text] of Object.entries(facts)) {
+      for (const [tag, content] of [["dt", name], ["dd", text]]) {
+        list.append(Object.assign(document.createElement(tag), { textContent: content }));
+      }
+    }
+  }
+
+  keyed(event) {
+    const key = event.key.toLowerCase(), view = Object.keys(VIEWS)[Number(key) - 1];
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (key >= "1" && key <= "4" && key.length === 1) document.querySelector(`input[name="view"][value="${view}"]`).click();
+    if (key === "c") byId("layer-cameras").click();
+    if (key === "p") byId("layer-points").click();
+    if (key === "r") this.viewer.reset();
+  }
+
+  /** A line over the picture, for a moment or until the next. */
+  say(text, briefly = false) {
+    byId("message").textContent = text;
+    clearTimeout(this.saying);
+    if (briefly) this.saying = setTimeout(() => this.say(""), SAID_MS);
+  }
+
+  /** Brings everything in line with the viewer. */
+  update() {
+    const { viewer } = this, { photo } = viewer, distance = viewer.distance();
+    document.querySelector(`input[name="view"][value="${viewer.view}"]`).checked = true;
+    byId("distance").textContent = distance ? `${distance.value.toPrecision(4)} ${distance.unit}` : viewer.measured.length ? "one point" : "–";
+    const count = viewer.path.keys.length;
+    byId("path-count").textContent = count ? `${count} key-frame${count > 1 ? "s" : ""}` : "No key-frames";
+    byId("path-save").disabled = byId("path-play").disabled = count < 2;
+    byId("path-remove").disabled = count < 1;
+    byId("compare").hidden = photo === null;
+    byId("views").value = photo ?? "";
+    const picture = photo === null ? null : viewer.contents.section(`photo${photo}`);
+    byId("photo").hidden = !picture;
+    if (photo === null) return;
+    byId("photo-name").textContent = viewer.contents.views[photo].name;
+    byId("photo-share").disabled = !picture;
+    if (picture) this.showPicture(photo, picture);
+  }
+
+  showPicture(photo, bytes) {
+    const image = byId("photo-image"), { canvas, lens } = this.viewer;
+    if (this.pictured !== photo) {
+      URL.revokeObjectURL(image.src);
+      image.src = URL.createObjectURL(new Blob([bytes], { type: "image/jpeg" }));
+      this.pictured = photo;
+    }
+    const box = canvas.getBoundingClientRect(), { scale } = fitted(lens, box.width, box.height);
+    const [width, height] = [lens.width * scale, lens.height * scale];
+    Object.assign(byId("photo").style, {
+      left: `${(box.width - width) / 2}px`, top: `${(box.height - height) / 2}px`, width: `${width}px`, height: `${height}px`,
+      clipPath: `inset(0 ${100 - byId("photo-share").value}% 0 0)`,
+    });
+  }
+
+  /** Puts the label of the measured distance where its line is. */
+  place(request) {
+    const { viewer } = this, distance = viewer.distance(), label = byId("label");
+    if (viewer.photo !== null) this.update();
+    label.hidden = !distance;
+    if (!distance) return;
+    const middle = scaled(add(...viewer.measured), 0.5), box = viewer.canvas.getBoundingClientRect();
+    const at = projected(request.pose, fitted(request.lens, box.width, box.height), middle);
+    label.hidden = at.depth <= 0;
+    label.textContent = `${distance.value.toPrecision(4)} ${distance.unit}`;
+    Object.assign(label.style, { left: `${at.x}px`, top: `${at.y}px` });
+  }
+
+  async screenshot() {
+    const { width, height } = this.viewer.canvas, canvas = Object.assign(document.createElement("canvas"), { width, height });
+    this.say("Drawing all pixels …");
+    const pixels = await this.viewer.renderer.picture(width, height);
+    for (let i = 3; i < pixels.length; i += 4) pixels[i] = 255;
+    canvas.getContext("2d").putImageData(new ImageData(pixels, width, height), 0, 0);
+    canvas.toBlob((blob) => save(blob, "picture.png"));
+    this.say("");
+  }
+}
+
+/** Hands a file to the user. */
+function save(blob, name) {
+  const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+}

@@ -1,0 +1,222 @@
+"""viewer.html in a browser: its picture is the Python renderer's, its controls do what they say, it asks no network."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nerf.effects.appearance import AppearanceModel
+from stages import viewer
+from stages.contract import run_stage
+from stages.effects.image_effects import photo_effects
+from stages.io.files import read_json
+from stages.render.path import path_from_file
+from stages.viewer.tables import quantised, with_table
+from tests.conftest import SilentProgress
+from tests.stages.photo_scene import FOCAL, HEIGHT, WIDTH
+from tests.stages.viewer.browser import Viewer, chromium, pinhole_rays, psnr, rendered, request_of
+from tests.stages.viewer.made_fields import Made, gains, inside_pose, made, renamed
+
+MIN_AGREEMENT = 45.0  # dB; 8 bits of a picture alone leave 59
+LENS = [48, 36, 40.0, 41.0, 22.0, 19.0]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as running:
+        yield running
+
+
+def written(folder: Path, space: str, config: viewer.Config | None = None, **info: Any) -> tuple[Made, Path]:
+    """A made field and its page."""
+    field = made(folder, space, **info)
+    renamed(field)
+    out = folder / "viewer"
+    out.mkdir()
+    run_stage(viewer, config or viewer.Config(bits="8"), field.inputs, out, SilentProgress())
+    return field, out / "viewer.html"
+
+
+@pytest.fixture(scope="module")
+def ball(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Viewer]:
+    """A page of a box, shared by tests that leave it as they find it."""
+    page = Viewer(browser, written(tmp_path_factory.mktemp("box"), "box")[1])
+    yield page
+    page.close()
+
+
+@pytest.mark.parametrize("space", ["box", "contraction", "ndc"])
+def test_the_picture_is_that_of_the_python_renderer(browser: Any, tmp_path: Path, space: str):
+    field, file = written(tmp_path, space)
+    packed = with_table(field.field, quantised(field.field.layout, field.field.table, 8))
+    page, background = Viewer(browser, file), [1.0, 1.0, 1.0] if space == "box" else [0.0, 0.0, 0.0]
+    poses = [field.scene.views[0].scene_from_camera, field.scene.views[3].scene_from_camera, inside_pose()]
+    opacities = []
+    for pose in poses:
+        near_far = (0.05, 30.0)
+        drawn = page.picture(LENS[0], LENS[1], request_of(pose, LENS, near_far))
+        colour, opacity = rendered(packed, pinhole_rays(pose, LENS, near_far), background)
+        assert psnr(drawn[..., :3], colour) > MIN_AGREEMENT and psnr(drawn[..., 3], opacity) > MIN_AGREEMENT
+        assert psnr(drawn[:, ::-1, :3], colour) < 30
+        opacities.append(opacity)
+    assert np.ptp(opacities[0]) > 0.5, "the pictures must show something and what lies behind it"
+    assert page.faults == []
+    page.close()
+
+
+def test_16_bits_colours_without_directions_and_effects(browser: Any, tmp_path: Path):
+    names = [f"{index}.png" for index in range(8)]
+    field = made(tmp_path, "contraction", view_dependence=False, effects=gains(names))
+    (tmp_path / "viewer").mkdir()
+    run_stage(viewer, viewer.Config(bits="16"), field.inputs, tmp_path / "viewer", SilentProgress())
+    page, view = Viewer(browser, tmp_path / "viewer/viewer.html"), field.scene.views[3]
+    packed = with_table(field.field, quantised(field.field.layout, field.field.table, 16))
+    info = read_json(field.inputs["train"] / "field.json")
+    shown = AppearanceModel(packed, photo_effects(info, field.scene, view))
+    lens = [WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]
+    of_photo = page.run("() => (({log_gain, falloff}) => ({logGain: log_gain, falloff}))(viewer.contents.views[3])")
+    drawn = page.picture(WIDTH, HEIGHT, request_of(view.scene_from_camera, lens, (2.0, 4.0), **of_photo))
+    colour, _ = rendered(shown, pinhole_rays(view.scene_from_camera, lens, (2.0, 4.0)), [0.0, 0.0, 0.0])  # pyright: ignore
+    assert psnr(drawn[..., :3], colour) > MIN_AGREEMENT
+    assert not page.run("document.getElementById('exposure-row').hidden")
+    page.close()
+
+
+def test_drag_wheel_and_keys_move_the_camera(ball: Viewer):
+    before, mouse = ball.run("viewer.navigation.pose"), ball.page.mouse
+    mouse.move(20, 70)
+    mouse.down()
+    mouse.move(40, 70)
+    mouse.up()
+    turned = ball.run("viewer.navigation.pose")
+    distance = ball.run("viewer.navigation.distance")
+    assert np.linalg.norm(np.subtract(turned["centre"], before["centre"])) > 0.1
+    mouse.wheel(0, -200)
+    ball.until(f"viewer.navigation.distance < {0.9 * distance}")
+    ball.page.keyboard.down("w")
+    ball.until(f"norm(subtract(viewer.navigation.pose.centre, {turned['centre']})) > 0.3")
+    ball.page.keyboard.up("w")
+    ball.run("viewer.reset()")
+    ball.until("!viewer.navigation.flight")
+    assert np.allclose(ball.run("viewer.navigation.pose.centre"), before["centre"])
+
+
+def test_two_fingers_zoom(ball: Viewer):
+    pinch = """() => {
+      const finger = (type, id, x) => viewer.canvas.dispatchEvent(new PointerEvent(type, {
+        pointerId: id, pointerType: "touch", clientX: x, clientY: 30, bubbles: true, buttons: 1 }));
+      viewer.canvas.setPointerCapture = () => {};
+      const before = viewer.navigation.distance;
+      finger("pointerdown", 11, 30); finger("pointerdown", 12, 50);
+      finger("pointermove", 12, 70); finger("pointermove", 11, 10);
+      finger("pointerup", 11, 10); finger("pointerup", 12, 70);
+      return before / viewer.navigation.distance; }"""
+    assert ball.run(pinch) == pytest.approx(3.0, rel=1e-6)
+    ball.run("viewer.reset()")
+    ball.until("!viewer.navigation.flight")
+
+
+def test_views_differ_and_all_pixels_fill_in(ball: Viewer):
+    pictures = {}
+    for number, view in enumerate(("colour", "depth", "normals", "opacity"), 1):
+        ball.page.locator("#canvas").press(str(number))
+        assert ball.run("viewer.view") == view
+        pictures[view] = ball.shown()
+    assert len({picture.tobytes() for picture in pictures.values()}) == 4
+    ball.page.locator("#canvas").press("1")
+
+
+def test_a_click_on_a_camera_shows_its_photo(ball: Viewer):
+    ball.run("document.getElementById('layer-cameras').click()")
+    where = """() => { const { width, height } = viewer.canvas, lens = fitted(viewer.lens, width, height);
+      const views = viewer.contents.views;
+      const at = views.map((v) => projected(viewer.navigation.pose, lens, v.pose.centre));
+      const index = at.findIndex((p) => p.depth > 0 && p.x > 2 && p.x < width - 2 && p.y > 2 && p.y < height - 2
+        && (p.x < 50 || p.y > 48)); // beside the menu
+      return [index, at[index].x, at[index].y]; }"""
+    index, x, y = ball.run(where)
+    ball.page.mouse.click(x, y)
+    ball.until(f"viewer.photo === {index}")
+    assert not ball.run("document.getElementById('photo').hidden")
+    assert ball.run("document.getElementById('photo-name').textContent") == ball.run(
+        f"viewer.contents.views[{index}].name"
+    )
+    assert ball.run("document.querySelectorAll('b').length") == 0, "a name is text and no HTML"
+    ball.run("document.getElementById('layer-cameras').click()")
+    ball.run("viewer.reset()")
+    ball.until("!viewer.navigation.flight")
+    assert ball.run("document.getElementById('photo').hidden")
+
+
+def test_a_measured_length_is_that_of_the_scene(ball: Viewer):
+    """Two pixels of the same picture and the Python renderer's camera: the length follows from the two distances."""
+    pick = """() => { const c = viewer.canvas; viewer.measured = [];
+      const found = []; for (let y = 8; y < c.height; y += 8) for (let x = 4; x < c.width; x += 8) {
+        const point = viewer.pointAt(x, y); if (point) found.push([x, y, point]); }
+      return found; }"""
+    found = ball.run(pick)
+    (x, y, first), (u, v, last) = found[0], found[-1]
+    ball.run("([x, y, u, v]) => { viewer.measure(x, y); viewer.measure(u, v); }", [x, y, u, v])
+    length = ball.run("viewer.distance()")
+    assert length["unit"] == "scene units" and length["value"] == pytest.approx(
+        np.linalg.norm(np.subtract(first, last))
+    )
+    assert 0.1 < length["value"] < 4
+    ball.run("viewer.measured = []")
+
+
+def test_a_saved_path_is_read_back_by_render(ball: Viewer, tmp_path: Path):
+    scene = made(tmp_path, "box").scene
+    ball.run("viewer.path.keys = viewer.contents.views.slice(0, 3).map((view) => view.pose)")
+    (tmp_path / "path.json").write_text(json.dumps(ball.run("viewer.pathJson(0.1)")), "utf-8")
+    path = path_from_file(scene, tmp_path / "path.json")
+    assert len(path.cameras) == 7 and (path.cameras[0].width, path.cameras[0].height) == (WIDTH, HEIGHT)
+    for frame, view in ((0, 0), (3, 1), (6, 2)):
+        assert np.abs(path.poses[frame] - scene.views[view].scene_from_camera).max() < 1e-6
+    ball.run("viewer.path.keys = []")
+
+
+def test_the_crop_box_leaves_nothing_outside(ball: Viewer):
+    before = ball.shown()
+    ball.run("viewer.crop = {low: [0.8, 0.8, 0.8], high: [0.9, 0.9, 0.9]}; viewer.changed()")
+    assert np.ptp(before) > 50 and np.ptp(ball.shown().reshape(-1, 4)[:, :3]) == 0
+    ball.run("viewer.crop = null; viewer.changed()")
+
+
+def test_a_lost_context_comes_back(ball: Viewer):
+    before = ball.shown()
+    ball.run("window.loss = viewer.renderer.graphics.gl.getExtension('WEBGL_lose_context'); loss.loseContext()")
+    ball.until("viewer.renderer.graphics.gl.isContextLost()")
+    ball.run("loss.restoreContext()")
+    ball.until("!viewer.renderer.graphics.gl.isContextLost()")
+    assert np.array_equal(ball.shown(), before)
+
+
+def test_the_address_holds_the_view(browser: Any, ball: Viewer, tmp_path: Path):
+    ball.run("viewer.navigation.orbit(0.3, 0.1); viewer.writeLink()")
+    pose, link = ball.run("viewer.navigation.pose"), ball.run("location.hash")
+    file = Path(ball.run("decodeURIComponent(location.pathname)"))
+    other = Viewer(browser, file, fragment=link)
+    assert np.allclose(other.run("viewer.navigation.pose.centre"), pose["centre"], atol=1e-5)
+    assert np.allclose(other.run("viewer.navigation.pose.rotation"), pose["rotation"], atol=1e-5)
+    other.close()
+    ball.run("viewer.reset()")
+
+
+def test_controls_are_labelled_and_the_page_is_quiet(ball: Viewer):
+    unnamed = """() => [...document.querySelectorAll("button, input, select, summary, canvas")]
+      .filter((e) => !(e.labels?.length || e.textContent.trim() || e.getAttribute("aria-label"))).map((e) => e.id)"""
+    assert ball.run(unnamed) == []
+    assert ball.faults == []
+
+
+def test_a_browser_without_webgl_2_is_told(browser: Any, tmp_path: Path):
+    context = browser.new_context()
+    page = context.new_page()
+    page.add_init_script("delete window.WebGL2RenderingContext")
+    page.goto(written(tmp_path, "box")[1].as_uri())
+    assert "WebGL 2" in page.locator("#message").inner_text()
+    context.close()
