@@ -2,11 +2,14 @@
 
     pipeline run PHOTOS --until depth
     python -m benchmarks.depth_supervision PHOTOS.nerf … --downscale 2 --steps 600 1500 --seeds 0 1 2
+    python -m benchmarks.depth_supervision PHOTOS.nerf --downscale 1 --seconds 60 180 300 --depth-seconds 12
 
-A row for each workspace, number of steps, finest grid, seed and arm. Everything but the depth maps is the same, and as
-stage train has it, with view dependence and a background model. PSNR and SSIM are of --tiles tiles of the test photos
-at full size. ``early_rays_percent``: rays of a step in the first tenth of the run over those in the last tenth, at
-equal colour evaluations. ``cpu_seconds`` are of all cores, without scoring; what stage depth took is not in them.
+With --seconds trainings have equal time instead, the depth maps paid for: --depth-seconds is what `pipeline depth`
+said. A row for each workspace, number of steps or seconds, finest grid, seed and arm. Everything but the depth maps is
+the same, and as stage train has it, with view dependence and a background model. PSNR and SSIM are of --tiles tiles of
+the test photos at full size. ``early_rays_percent``: rays of a step in the first tenth of the steps over those in the
+last tenth, at equal colour evaluations; ``early_rays_per_second_percent``: rays of the first ten seconds over those of
+the last ten. ``cpu_seconds`` are of all cores, without scoring; what stage depth took is not in them.
 """
 
 import argparse
@@ -39,7 +42,8 @@ from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.fields.space import chosen_space
 
 DECISIONS = Decisions({"view_dependence": {}, "background": {}})
-MICRO_BATCHES = 2  # fixed, so that results do not depend on the machine
+MICRO_BATCHES = 2  # fixed, so that results of equal steps do not depend on the machine
+TIMED_SECONDS = 10.0  # at the beginning and at the end
 
 
 def config_of(scene: Any, given: argparse.Namespace, run: dict[str, Any]) -> Config:
@@ -54,7 +58,14 @@ def config_of(scene: Any, given: argparse.Namespace, run: dict[str, Any]) -> Con
     )
     space, _ = chosen_space(DECISIONS, scene)
     return with_defaults(
-        Config(steps=run["steps"], downscale=given.downscale, space=space, view_dependence=True, grid=grid)
+        Config(
+            steps=run["steps"],
+            seconds=run["seconds"],
+            downscale=given.downscale,
+            space=space,
+            view_dependence=True,
+            grid=grid,
+        )
     )
 
 
@@ -74,23 +85,36 @@ def train(config: Config, scene: Any, dataset: RayDataset, run: dict[str, Any], 
     effects = image_effects(DECISIONS, scene, scene.of_split("train"), dataset)
     trainer = make_trainer(config, scene, dataset, run["seed"], effects)
     assert isinstance(trainer, HashGridTrainer)
-    cpu, rays, colours, densities = time.process_time(), list[int](), 0, 0
-    for step in range(run["steps"]):
-        result = trainer.step(step, step / run["steps"])
+    cpu, began = time.process_time(), time.perf_counter()
+    rays, ends, colours, densities = list[int](), list[float](), 0, 0
+    while (progress := _progress(run, len(rays), time.perf_counter() - began)) < 1:
+        result = trainer.step(len(rays), progress)
         rays.append(result.rays)
+        ends.append(time.perf_counter() - began)
         colours, densities = colours + result.colour_evaluations, densities + result.density_evaluations
     cpu = time.process_time() - cpu
-    tenth = max(1, run["steps"] // 10)
+    tenth = max(1, len(rays) // 10)
+    early, late = (
+        sum(r for r, end in zip(rays, ends, strict=True) if low < end <= low + TIMED_SECONDS)
+        for low in (0, ends[-1] - TIMED_SECONDS)
+    )
     of_psnr, of_ssim = scores(trainer, benchmark)
     return {
         "psnr": round(of_psnr, 3),
         "ssim": round(of_ssim, 4),
+        "trained_steps": len(rays),
         "million_rays": round(sum(rays) / 1e6, 3),
         "early_rays_percent": round(100 * sum(rays[:tenth]) / sum(rays[-tenth:])),
+        "early_rays_per_second_percent": round(100 * early / late) if run["seconds"] else None,
         "million_colours": round(colours / 1e6, 1),
         "million_densities": round(densities / 1e6, 1),
         "cpu_seconds": round(cpu, 1),
     }
+
+
+def _progress(run: dict[str, Any], step: int, elapsed: float) -> float:
+    """How much of the run is over."""
+    return step / run["steps"] if run["steps"] else elapsed / run["seconds"]
 
 
 def datasets(inputs: Inputs, scene: Any, downscale: float) -> dict[str, RayDataset]:
@@ -103,7 +127,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workspaces", type=Path, nargs="+")
     parser.add_argument("--downscale", type=float, default=2.0)
-    parser.add_argument("--steps", type=int, nargs="+", default=[600])
+    amount = parser.add_mutually_exclusive_group(required=True)
+    amount.add_argument("--steps", type=int, nargs="+")
+    amount.add_argument("--seconds", type=float, nargs="+", help="of depth maps and training together")
+    parser.add_argument("--depth-seconds", type=float, help="of the depth maps, with --seconds")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--max-res", type=int, nargs="+", default=[1024])
     parser.add_argument("--num-levels", type=int, default=6)
@@ -112,6 +139,8 @@ def main() -> None:
     parser.add_argument("--tiles", type=int, default=384)
     add_out(parser)
     given = parser.parse_args()
+    if (given.seconds is None) != (given.depth_seconds is None):
+        parser.error("--seconds and --depth-seconds go together")
     record = Record(given.out)
     take_over_cores()
     for root in given.workspaces:
@@ -121,8 +150,10 @@ def main() -> None:
         scene = read_scene(inputs["normalise"])
         arms = datasets(inputs, scene, given.downscale)
         benchmark = make_benchmark(inputs["ingest"], scene, None, given.tiles, 4.0)
-        for steps, max_res, seed, arm in product(given.steps, given.max_res, given.seeds, arms):
-            run = {"depth": arm, "seed": seed, "steps": steps, "max_res": max_res}
+        for amount, max_res, seed, arm in product(given.steps or given.seconds, given.max_res, given.seeds, arms):
+            paid = given.depth_seconds if given.seconds and arm == "on" else 0.0
+            run = {"depth": arm, "seed": seed, "max_res": max_res}
+            run |= {"steps": amount if given.steps else None, "seconds": amount - paid if given.seconds else None}
             figures = train(config_of(scene, given, run), scene, arms[arm], run, benchmark)
             record.add(set=root.stem, **run, **figures)
 

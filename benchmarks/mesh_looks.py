@@ -21,10 +21,12 @@ from benchmarks.record import Record, add_out
 from nerf.geometry.rays import Rays
 from pipeline.engine.display import SilentDisplay
 from pipeline.engine.workspace import Workspace
+from stages import mesh
+from stages.contract import plan_stage
 from stages.evaluate.image_metrics import ssim
 from stages.io.files import write_png
 from stages.io.pixels import load_pixels
-from stages.mesh import Config, plan
+from stages.mesh import Config
 from stages.mesh.extraction import Source, extract_mesh, load
 from stages.mesh.files import ColouredMesh
 from stages.mesh.rasteriser import barycentric, nearest_faces
@@ -107,7 +109,8 @@ def meshes_of(source: Source, train: Path, resolution: int) -> dict[str, tuple[C
     """The meshes compared, and whether to show their texture."""
     made = []
     for size in (Config().texture_size, 0):
-        config = plan(Config(resolution=resolution, texture_size=size), {"train": train}, SilentDisplay())
+        asked = Config(resolution=resolution, texture_size=size)
+        config = plan_stage(mesh, asked, {"train": train}, SilentDisplay())
         made.append(extract_mesh(config, source, SilentDisplay()).mesh)
     return {"texture": (made[0], True), "vertex": (made[0], False), "untextured": (made[1], False)}
 

@@ -1,5 +1,6 @@
 """Shared by all tests: shape checking of nerf/, and where the real photo sets are."""
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -65,6 +66,19 @@ class SilentProgress:
 def cores_are_free(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever took over the cores in another test (nerf/runtime/parallel.py)."""
     monkeypatch.setattr("nerf.runtime.parallel._taken", None)
+
+
+@pytest.fixture
+def use_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]]:
+    """Sets the number of threads, both torch's and those of chunks."""
+    before = torch.get_num_threads()
+
+    def use(count: int) -> None:
+        monkeypatch.setattr("nerf.runtime.parallel._taken", None)
+        torch.set_num_threads(count)
+
+    yield use
+    torch.set_num_threads(before)
 
 
 @pytest.fixture

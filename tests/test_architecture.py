@@ -53,19 +53,6 @@ BOUNDARIES = {
 }
 MACHINE = ("time", "cores", "processors", "compute_device", "available_bytes", "available_on")  # wherever imported
 PATCHING = ("setattr", "setitem", "delattr")
-# Sizes that make a test of several packages short, and faults that nothing hands in.
-PATCHED_ELSEWHERE = {
-    "tests/drills/test_divergence.py": ("MIN_HEALTHY_STEPS", "write_profile", "EVALUATION_PIXELS", "UPDATE_INTERVAL"),
-    "tests/nerf/fields/test_hash_grid.py": ("",),  # lengths of marching rounds
-    "tests/nerf/kernels/warp/test_threads.py": ("CHUNK_POINTS",),
-    "tests/pipeline/cli/test_commands.py": ("_photos_digest",),
-    "tests/pipeline/demo/test_demo.py": ("_run_stages", "with_source"),
-    "tests/pipeline/doctor/test_bench.py": ("STREAMED_FLOATS", "MIN_STREAMED_FLOATS"),
-    "tests/stages/evaluate/test_evaluate.py": ("MAX_SCORED_SIDE",),
-    "tests/stages/tradeoff/test_tradeoff.py": ("TILE_SIZE",),
-    "tests/stages/train/test_data.py": ("DECODING_BYTES", "ThreadPoolExecutor"),
-    "tests/stages/train/test_train.py": ("sigma_of",),
-}
 NO_SUBJECT = ("utils.py", "util.py", "helpers.py", "misc.py", "common.py")
 BACKENDS = ("torch", "warp")
 BANNED_CALLS = ("cumprod", "torch.load", "eval")
@@ -430,9 +417,7 @@ def test_stages_are_planned_in_one_place():
 
 
 def test_tests_patch_what_they_test():
-    found = {module.name: {path.split(".")[-1] for path in foreign_patches(module)} for module in AROUND}
-    wanted = {name: set(names) for name, names in PATCHED_ELSEWHERE.items()}
-    assert {name: names for name, names in found.items() if names} == wanted
+    assert offenders(foreign_patches, AROUND) == []
 
 
 def test_names_of_tests_have_few_words():

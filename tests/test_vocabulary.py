@@ -1,4 +1,6 @@
-"""Retired words stay out of code, command line, report and documents; CHANGELOG alone may name them.
+"""Retired words stay out of code, command line, report, documents and what a run writes; CHANGELOG alone may name them.
+
+tests/end_to_end/test_chain.py looks for them in the outputs of a run.
 
 Each entry is a regular expression and the field's standard term that stands in its place.
 """
@@ -34,6 +36,9 @@ SCENE_FIELDS_RENDERING: dict[str, str] = {
     r"range_between_views": "near_and_far_between_views",
     r"\b(StepPlan|Decision)\b": "StepSchedule, ScheduleRevision",
     r"\bGUIDED_EVERY\b": "sparse depth supervision",
+    r"\bFOLDED\b|\b[Ff]olded space|space folded": "contraction, contracted space",
+    r"\bnearest photo\b": "nearest training view",
+    r"(?i)\bunseen photos?\b": "test photo",
 }
 
 EFFECTS: dict[str, str] = {

@@ -1,4 +1,4 @@
-"""Camera paths for videos that stay where photos were taken: a path through unseen space shows unseen space.
+"""Camera paths for videos that stay near the photos: space that no photo shows renders badly.
 
 All paths are poses ``scene_from_camera`` [rotation | centre] of shape (frames, 3, 4), numpy float64, rotations
 orthonormal, OpenCV axes, in the scene frame where +z is up. ``orbit`` and ``spiral`` return to where they began: the

@@ -1,4 +1,4 @@
-"""All of space folded into a cube, and back.
+"""Scene contraction: all of space into a cube, and its inverse.
 
 Points within the unit cube stay where they are; a point at infinity-norm distance r > 1 goes to 2 - 1/r along its
 own ray from the origin. (mip-NeRF 360, Barron et al. 2022, eq. 10, with the infinity norm of nerfacto in place of

@@ -26,12 +26,12 @@ def rotation_angles(
 
 
 def neighbour_weights(
-    unseen: Float[np.ndarray, "m 3 4"], known: Float[np.ndarray, "n 3 4"]
+    held_out: Float[np.ndarray, "m 3 4"], known: Float[np.ndarray, "n 3 4"]
 ) -> Float[np.ndarray, "m n"]:
-    """How much each known photo tells of each unseen one: inverse squares of distance among the NEIGHBOURS nearest
+    """How much each known photo tells of each held-out one: inverse squares of distance among the NEIGHBOURS nearest
     (Shepard 1968), rows that sum to 1. Photos at no distance at all share everything."""
-    weights = np.zeros((len(unseen), len(known)))
-    for row, pose in zip(weights, unseen, strict=True):
+    weights = np.zeros((len(held_out), len(known)))
+    for row, pose in zip(weights, held_out, strict=True):
         distance = pose_distances(pose, known)
         nearest = np.argsort(distance, kind="stable")[:NEIGHBOURS]
         least = distance[nearest[0]]

@@ -15,7 +15,7 @@ from stages.evaluate.seconds import SHARE, other_seconds
 from stages.train import trained_seconds
 
 INPUTS = ("ingest", "normalise", "train")
-VERSION = 16
+VERSION = 17
 EXIT_CODE = 15
 RESUMES = False
 PUBLISHED = ("metrics.json", "renders", "errors")

@@ -16,7 +16,7 @@ from stages.effects.decisions import Space
 
 INPUTS = ("ingest", "normalise", "effects")
 OPTIONAL_INPUTS = ("train",)
-VERSION = 15
+VERSION = 16
 EXIT_CODE = 19
 RESUMES = True
 ON_REQUEST = True

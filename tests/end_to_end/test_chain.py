@@ -2,8 +2,11 @@
 
 import json
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,7 @@ from pipeline.cli.commands import run_command
 from pipeline.engine.stage_list import STAGES
 from stages.contract import StageConfig, declared
 from tests.small_scenes import write_blender_scene
+from tests.test_vocabulary import RETIRED, offenders
 from tests.video_files import read_video
 
 SUMMARY_KEYS = {
@@ -44,7 +48,10 @@ def output(planned: Counter[str], tmp_path_factory: pytest.TempPathFactory) -> P
     """The output folder of a run on a small set with known cameras."""
     folder = tmp_path_factory.mktemp("chain")
     photos = write_blender_scene(folder / "photos", train=14, test=3)
-    assert run_command(["run", str(photos), "-o", str(folder / "w.nerf"), *SMALL]) == 0
+    with redirect_stdout(StringIO()) as said:
+        assert run_command(["run", str(photos), "-o", str(folder / "w.nerf"), *SMALL]) == 0
+        assert run_command(["status", str(folder / "w.nerf")]) == 0
+    (folder / "said.txt").write_text(said.getvalue(), "utf-8")
     return folder / "w.nerf/output"
 
 
@@ -52,6 +59,21 @@ def test_every_stage_is_planned_once(output: Path, planned: Counter[str]):
     assert planned == dict.fromkeys(["sfm", "effects", "train", "evaluate", "render", "mesh"], 1)
     assert run_command(["resume", str(output.parent)]) == 0
     assert set(planned.values()) == {1}
+
+
+def written(workspace: Path) -> dict[str, str]:
+    """Path and text of everything that a run wrote in words, without the pictures in its page."""
+    kinds = (".json", ".jsonl", ".html", ".log")
+    files = [file for file in sorted(workspace.rglob("*")) if file.suffix in kinds]
+    texts = {file.relative_to(workspace).as_posix(): file.read_text("utf-8", "replace") for file in files}
+    return {name: re.sub(r"data:[\w/+;=,-]+", "", text) for name, text in texts.items()}
+
+
+def test_no_retired_word_is_written_or_said(output: Path):
+    texts = written(output.parent) | {"said": (output.parent.parent / "said.txt").read_text("utf-8")}
+    assert {"run.json", "output/report.html", "output/summary.json"} <= texts.keys()
+    assert "ingest" in texts["said"] and "cached" in texts["said"]
+    assert {old: places for old in RETIRED if (places := offenders(old, texts))} == {}
 
 
 def numbers_in(value: Any) -> list[float]:

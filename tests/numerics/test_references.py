@@ -15,7 +15,7 @@ from pipeline.doctor.numerics import Case, error
 from pipeline.doctor.numerics.losses import GROWING
 from pipeline.doctor.numerics.matrix import CASES
 from pipeline.doctor.numerics.networks import COUNT
-from pipeline.doctor.numerics.space import FOLDED, OCTAVES
+from pipeline.doctor.numerics.space import CONTRACTED, OCTAVES
 
 mp.dps = 50
 Row = list[mpf]
@@ -37,13 +37,13 @@ def expansion(y: Row) -> Row:
     return [each / (m * (2 - m)) for each in y]
 
 
-def distance(s: Row, stepping: RayStepping = FOLDED) -> Row:
+def distance(s: Row, stepping: RayStepping = CONTRACTED) -> Row:
     step, cone = mpf(stepping.step_size), mpf(stepping.cone_angle)
     return [step / cone * mp.exp(cone * each - 1) if cone * each > 1 else step * each for each in s]
 
 
 def coordinate(t: Row) -> Row:
-    step, cone = mpf(FOLDED.step_size), mpf(FOLDED.cone_angle)
+    step, cone = mpf(CONTRACTED.step_size), mpf(CONTRACTED.cone_angle)
     return [(1 + mp.log(each * cone / step)) / cone if each * cone > step else each / step for each in t]
 
 

@@ -12,7 +12,7 @@ from nerf.kernels.torch.marching import s_to_t, t_to_s
 from pipeline.doctor.numerics import Bound, Case
 
 OCTAVES = 16
-FOLDED = RayStepping(step_size=0.002, cone_angle=0.008, contracted=True, occupancy_resolution=128, max_samples=1024)
+CONTRACTED = RayStepping(step_size=0.002, cone_angle=0.008, contracted=True, occupancy_resolution=128, max_samples=1024)
 NDC = Ndc((0.25, -2.0, 0.125), ((0.36, 0.48, -0.8), (-0.8, 0.6, 0.0), (0.48, 0.64, 0.6)), (0.75, 0.5), 0.75)
 NEAREST = MIN_DEPTH * NDC.near
 PER_RAY = 4
@@ -151,14 +151,14 @@ def _points_on(_: Backend, origins: Tensor, towards: Tensor, t: Tensor) -> Tenso
 
 
 def _distance(s: Tensor) -> Tensor:
-    beyond = FOLDED.cone_angle * s > 1
-    grown = FOLDED.linear_until * torch.exp(torch.where(beyond, FOLDED.cone_angle * s - 1, 0))
-    return torch.where(beyond, grown, FOLDED.step_size * s)
+    beyond = CONTRACTED.cone_angle * s > 1
+    grown = CONTRACTED.linear_until * torch.exp(torch.where(beyond, CONTRACTED.cone_angle * s - 1, 0))
+    return torch.where(beyond, grown, CONTRACTED.step_size * s)
 
 
 def _coordinate(t: Tensor) -> Tensor:
-    relative = t / FOLDED.linear_until
-    return torch.where(relative > 1, 1 + torch.log(relative.clamp(min=1)), relative) / FOLDED.cone_angle
+    relative = t / CONTRACTED.linear_until
+    return torch.where(relative > 1, 1 + torch.log(relative.clamp(min=1)), relative) / CONTRACTED.cone_angle
 
 
 def _interval(s: Tensor) -> Tensor:
@@ -167,7 +167,7 @@ def _interval(s: Tensor) -> Tensor:
 
 
 def _intervals(_: Backend, s: Tensor) -> Tensor:
-    start, end = s_to_t(FOLDED, s), s_to_t(FOLDED, s + 1)
+    start, end = s_to_t(CONTRACTED, s), s_to_t(CONTRACTED, s + 1)
     return torch.stack([start, end, end - start], -1)
 
 
@@ -320,7 +320,7 @@ CASES = [
         where="nerf/kernels/torch/marching.py: s_to_t",
         typical=lambda: (uniform(1, 0, 1500, 512, 1),),
         extreme=lambda: (torch.tensor([[0.0], [1e-45], [1e-30], [125.0], [125.00001], [8000.0], [9000.0]]),),
-        function=lambda _, s: s_to_t(FOLDED, s),
+        function=lambda _, s: s_to_t(CONTRACTED, s),
         reference=_distance,
         value=Bound(5e-6, "itself"),
     ),
@@ -329,7 +329,7 @@ CASES = [
         where="nerf/kernels/torch/marching.py: t_to_s",
         typical=lambda: (decades(1, -3, 3, 512, 1),),
         extreme=lambda: (torch.tensor([[0.0], [1e-45], [1e-30], [0.25], [0.25000003], [1e30], [1e37]]),),
-        function=lambda _, t: t_to_s(FOLDED, t),
+        function=lambda _, t: t_to_s(CONTRACTED, t),
         reference=_coordinate,
         value=Bound(1e-6, "itself"),
     ),

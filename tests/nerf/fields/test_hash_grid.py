@@ -1,7 +1,5 @@
 import math
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -9,44 +7,22 @@ from torch import Tensor
 
 from nerf.fields import mlp
 from nerf.fields.background import BACKGROUND_LAYOUT, background_colour
-from nerf.fields.hash_grid import THINNING_THRESHOLD, HashGridField, HashGridSettings
+from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.interface import RadianceModel, Rendering
 from nerf.geometry.rays import Rays
-from nerf.geometry.space_maps import Contraction, Ndc
-from nerf.kernels import Backend, GridLayout, RayStepping, Samples, warp
+from nerf.kernels import Backend, GridLayout, warp
 from nerf.kernels import torch as reference
 from nerf.kernels.torch.occupancy import binary_occupancy
-from nerf.rendering.early_termination import EARLY_STOP_TRANSMITTANCE
-
-SMALL = HashGridSettings(
-    num_levels=2, log2_hashmap_size=9, base_res=3, max_res=9, diagonal_steps=24, occupancy_resolution=8
+from tests.nerf.hash_grid_fields import (
+    BACKENDS,
+    CONTRACTED,
+    DIFFUSE,
+    FORWARD,
+    OUTDOORS,
+    SMALL,
+    field,
+    rays,
 )
-FOLDED = replace(SMALL, space=Contraction(), min_step_size=0.1, cone_angle=0.2)
-OUTDOORS = replace(FOLDED, background_model=True)
-DIFFUSE = replace(SMALL, view_dependence=False)
-FORWARD = replace(
-    OUTDOORS, space=Ndc((0.1, -1.5, 0.0), ((0.96, 0.28, 0.0), (0.0, 0.0, -1.0), (-0.28, 0.96, 0.0)), (1.2, 1.4), 0.4)
-)
-BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["reference", "warp"])
-
-
-def field(settings: HashGridSettings = SMALL, seed: int = 1) -> HashGridField:
-    """A field in float64 whose features are large enough to matter."""
-    model = HashGridField(settings, seed, reference).double()
-    model.table.mul_(2e4)
-    if settings.background_model:
-        model.background_table.normal_(generator=torch.Generator().manual_seed(5))
-    return model
-
-
-def rays(count: int = 6) -> Rays:
-    generator = torch.Generator().manual_seed(2)
-    origins = torch.randn(count, 3, generator=generator, dtype=torch.float64)
-    origins = 1.7 * origins / origins.norm(dim=-1, keepdim=True)
-    towards = 0.5 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - origins
-    ends = torch.full((2, count), 0.3, dtype=torch.float64)
-    ends[1] = 4.0
-    return Rays(origins, towards / towards.norm(dim=-1, keepdim=True), *ends)
 
 
 def seen_by_autograd(model: HashGridField, given: Rays, jitter: Tensor, background: Tensor) -> Tensor:
@@ -92,7 +68,7 @@ def encoded_by_autograd(layout: GridLayout, table: Tensor, points: Tensor) -> Te
     return torch.cat(features, -1)
 
 
-@pytest.mark.parametrize("settings", [SMALL, FOLDED, OUTDOORS, DIFFUSE, FORWARD])
+@pytest.mark.parametrize("settings", [SMALL, CONTRACTED, OUTDOORS, DIFFUSE, FORWARD])
 def test_all_gradients_are_those_of_autograd(settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nerf.fields.hash_grid.THINNING_THRESHOLD", 0.0)
     monkeypatch.setattr(mlp, "BLOCK", {"cpu": 7})  # so that there are several, the last one short
@@ -141,7 +117,7 @@ def test_it_is_a_radiance_model_of_the_scene_frame() -> None:
     assert colour.shape == points.shape and ((colour > 0) & (colour < 1)).all()
     compiled = HashGridField(SMALL, 0, warp)
     assert compiled.density_and_colour(points.float(), towards.float().expand_as(points))[1].shape == points.shape
-    assert (field(FOLDED).density(1e6 * points) > 0).all()
+    assert (field(CONTRACTED).density(1e6 * points) > 0).all()
 
 
 def test_density_agrees_with_what_rays_see() -> None:
@@ -159,7 +135,7 @@ def test_density_agrees_with_what_rays_see() -> None:
 
 def test_contracted_space_is_rendered_with_closer_samples_than_trained() -> None:
     """The opacity of a drawn ray by the middle rule with shorter steps; a box keeps its own."""
-    model, given = field(FOLDED), rays()
+    model, given = field(CONTRACTED), rays()
     closer = model.stepping._replace(
         step_size=model.stepping.step_size / 1.5, cone_angle=model.stepping.cone_angle / 1.5, max_samples=1536
     )
@@ -181,7 +157,7 @@ def test_closed_cells_are_not_seen() -> None:
     assert rendering.colour[3].tolist() == [0.2, 0.4, 0.6]
 
 
-@pytest.mark.parametrize("settings", [SMALL, FOLDED])
+@pytest.mark.parametrize("settings", [SMALL, CONTRACTED])
 def test_density_is_zero_in_empty_cells_and_beyond_the_box(
     settings: HashGridSettings,
 ) -> None:
@@ -213,7 +189,7 @@ def test_a_new_sky_is_grey_all_around() -> None:
 
 @BACKENDS
 def test_a_new_sky_is_a_grey_background_bit_for_bit(backend: Backend) -> None:
-    with_sky, without = HashGridField(OUTDOORS, 1, backend), HashGridField(FOLDED, 1, backend)
+    with_sky, without = HashGridField(OUTDOORS, 1, backend), HashGridField(CONTRACTED, 1, backend)
     assert_same_field(with_sky, without)
     assert with_sky.state_dict().keys() - without.state_dict().keys() == {"background_table"}
 
@@ -274,79 +250,6 @@ def test_impossible_sizes_are_refused(wrong: dict, message: str) -> None:
         replace(SMALL, **wrong)
 
 
-def in_rounds(model: HashGridField, given: Rays, background: Tensor) -> tuple[Rendering, int]:
-    """The rendering, and of how many samples the density was asked for it."""
-    asked, encode = [0], reference.encode
-
-    def counted(layout: GridLayout, table: Tensor, points: Tensor) -> Tensor:
-        asked[0] += len(points)
-        return encode(layout, table, points)
-
-    counting: Any = SimpleNamespace(**vars(reference) | {"encode": counted})
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(model, "backend", counting)
-        return model.render(given, background), asked[0]
-
-
-def in_one_pass(
-    model: HashGridField, stepping: RayStepping, given: Rays, jitter: Tensor, background: Tensor, thin: float = 0.0
-) -> tuple[int, Samples, Rendering]:
-    """How many samples stand in occupied cells, those that can be seen, and what rays see; no rounds."""
-    samples = reference.march(binary_occupancy(model.occupancy_bits), stepping, given, jitter)
-    density = model._density_pass(reference.sample_points(given, samples, model.space.bends_rays))
-    front, seen = reference.visible_samples(samples, density.sigma, EARLY_STOP_TRANSMITTANCE, thin, jitter)
-    ray_hidden = mlp.direction_hidden(model.weights, reference.spherical_harmonics(given.directions))
-    colour = mlp.colour_forward(model.weights, reference, front, density.geometry_features[seen], ray_hidden).colour
-    behind = background.repeat(len(jitter), 1)
-    rendering, _ = reference.composite(front, density.sigma[seen], colour, behind, given.far)
-    return len(samples.t), front, rendering
-
-
-def in_short_rounds(monkeypatch: pytest.MonkeyPatch, whole: int, shortest: int, longest: int) -> None:
-    for name, length in {
-        "ROUND_SAMPLES": {"cpu": whole},
-        "MIN_ROUND_SAMPLES_PER_RAY": shortest,
-        "MAX_ROUND_SAMPLES_PER_RAY": {"cpu": longest},
-    }.items():
-        monkeypatch.setattr(f"nerf.rendering.early_termination.{name}", length)
-
-
-@pytest.mark.parametrize("settings", [SMALL, FOLDED])
-@pytest.mark.parametrize("lengths", [(1, 1, 1), (60, 2, 5), (1 << 15, 8, 64)])
-def test_waves_through_thin_fog_see_what_a_single_pass_sees(
-    settings: HashGridSettings, lengths: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    in_short_rounds(monkeypatch, *lengths)
-    model, given, background = field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    model.set_occupancy(
-        model.occupancy_bits.random_(generator=torch.Generator().manual_seed(5))
-    )  # half of the cells are closed
-    density_evaluations, front, whole = in_one_pass(
-        model, model.render_stepping, given, torch.full_like(given.near, 0.5), background
-    )
-    rounds, asked = in_rounds(model, given, background)
-    assert asked == density_evaluations == len(front.t) > 40
-    assert whole.opacity.min() < 0.5 < whole.opacity.max()
-    torch.testing.assert_close(tuple(rounds), tuple(whole), rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("settings", [SMALL, FOLDED])
-def test_waves_end_soon_behind_what_stops_the_light(
-    settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    in_short_rounds(monkeypatch, 80, 2, 64)
-    model, given, background = dense_field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    density_evaluations, front, whole = in_one_pass(
-        model, model.render_stepping, given, torch.full_like(given.near, 0.5), background
-    )
-    rounds, asked = in_rounds(model, given, background)
-    assert len(front.t) < asked < 0.7 * density_evaluations
-    assert whole.opacity.min() > 0.99
-    left = EARLY_STOP_TRANSMITTANCE * torch.tensor([1.0, 5.0, 1.0])  # of a ray's colour, depth and opacity
-    for one, other, most in zip(rounds, whole, left, strict=True):
-        assert 0 < (one - other).abs().max() < most
-
-
 def test_what_is_empty_follows_from_what_is_occupied() -> None:
     model = field(replace(SMALL, occupancy_resolution=32))
     for cell in (5, 17):
@@ -360,49 +263,8 @@ def test_what_is_empty_follows_from_what_is_occupied() -> None:
         )
 
 
-@pytest.mark.parametrize("settings", [SMALL, FOLDED])
-def test_compiled_rounds_see_what_a_single_pass_sees(
-    settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    model, given = (
-        HashGridField(replace(settings, occupancy_resolution=32), 0, warp),
-        rays(300).each(lambda part: part.float()),
-    )
-    model.table.mul_(3e4)
-    few = torch.randint(len(model.occupancy_bits), (40,), generator=torch.Generator().manual_seed(5))
-    model.set_occupancy(torch.zeros_like(model.occupancy_bits).index_fill_(0, few, -1))
-    pictures = []
-    for lengths in ((1 << 16, 64, 64), (1, 2, 2)):
-        in_short_rounds(monkeypatch, *lengths)
-        pictures.append(model.render(given, torch.ones(3)))
-    assert pictures[0].opacity.max() > 0.1
-    for one, other in zip(*pictures, strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("settings", [SMALL, FOLDED])
-@pytest.mark.parametrize("lengths", [(1, 1, 1), (80, 2, 64)])
-@pytest.mark.parametrize("dense", [False, True])
-def test_training_keeps_all_samples_whatever_the_rounds(
-    settings: HashGridSettings, lengths: tuple[int, int, int], dense: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    in_short_rounds(monkeypatch, *lengths)
-    model, given = (dense_field if dense else field)(settings), rays(40)
-    model.set_occupancy(model.occupancy_bits.random_(generator=torch.Generator().manual_seed(5)))
-    jitter = torch.rand(40, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
-    background = torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    density_evaluations, front, whole = in_one_pass(
-        model, model.stepping, given, jitter, background, THINNING_THRESHOLD
-    )
-    done = model.forward(given, jitter, jitter, background.repeat(40, 1))
-    assert done.density_evaluations < density_evaluations if dense else done.density_evaluations == density_evaluations
-    assert torch.equal(done.samples.starts, front.starts) and torch.equal(done.samples.ray, front.ray)
-    torch.testing.assert_close(done.samples[2:], front[2:], rtol=1e-9, atol=1e-12)
-    torch.testing.assert_close(tuple(done.rendering), tuple(whole), rtol=1e-9, atol=1e-9)
-
-
 @pytest.mark.parametrize(
-    "settings", [replace(SMALL, diagonal_steps=500), replace(FOLDED, min_step_size=0.005, cone_angle=0.01)]
+    "settings", [replace(SMALL, diagonal_steps=500), replace(CONTRACTED, min_step_size=0.005, cone_angle=0.01)]
 )
 def test_thin_samples_that_stand_for_others_keep_picture_and_gradients(
     settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch
@@ -428,17 +290,3 @@ def test_thin_samples_that_stand_for_others_keep_picture_and_gradients(
     for each, right in zip(zip(*found, strict=True), wanted, strict=True):
         mean = torch.stack(each).mean(0)
         assert (mean - right).abs().max() < 0.02 * right.abs().max()
-
-
-def test_a_ray_ends_after_the_most_samples_it_may_have(monkeypatch: pytest.MonkeyPatch) -> None:
-    in_short_rounds(monkeypatch, 1, 3, 3)
-    model, given = field(replace(SMALL, max_samples_per_ray=7)), rays(40)
-    middle = torch.full_like(given.near, 0.5)
-    done = model.forward(given, middle, middle, torch.zeros(40, 3, dtype=torch.float64))
-    assert done.density_evaluations == 7 * 40 and done.samples.starts.diff().max() <= 7
-
-
-def dense_field(settings: HashGridSettings) -> HashGridField:
-    model = field(settings)
-    model.density_out[0] = model.density_out[0].abs() * 4
-    return model

@@ -18,8 +18,8 @@ from nerf.kernels.torch.occupancy import binary_occupancy
 
 TOLERANCE = 1e-5
 BOUNDED = RayStepping(2 * BOX * 3**0.5 / 256, 0.0, False, 32, 1024)
-FOLDED = RayStepping(0.01, 0.02, True, 32, 1024)
-STEPPINGS = {"bounded": BOUNDED, "folded": FOLDED}
+CONTRACTED = RayStepping(0.01, 0.02, True, 32, 1024)
+STEPPINGS = {"bounded": BOUNDED, "contracted": CONTRACTED}
 
 
 def generator(seed: int) -> torch.Generator:

@@ -14,7 +14,7 @@ from tests.devices import DEVICES, skip_without
 
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["reference", "warp"])
 COUNTS = (0, 4, 1, 4, 4, 0, 3, 4)
-BOUNDED, FOLDED = RayStepping(0.05, 0.0, False, 8, 4), RayStepping(0.05, 0.1, True, 8, 4)
+BOUNDED, CONTRACTED = RayStepping(0.05, 0.0, False, 8, 4), RayStepping(0.05, 0.1, True, 8, 4)
 
 
 @pytest.fixture(params=DEVICES, autouse=True)
@@ -52,7 +52,7 @@ def jitters(count: int) -> Tensor:
 
 
 @BACKENDS
-@pytest.mark.parametrize("stepping", [BOUNDED, FOLDED])
+@pytest.mark.parametrize("stepping", [BOUNDED, CONTRACTED])
 def test_rays_with_light_go_on_behind_their_last_sample(backend: Backend, stepping: RayStepping) -> None:
     samples = round_of(COUNTS)
     sigma = random_numbers(len(samples.t), 2)
@@ -101,7 +101,7 @@ def test_a_ray_whose_density_is_no_number_ends_there(backend: Backend) -> None:
 @BACKENDS
 @pytest.mark.parametrize("sigma", [0.0, 1e-45, 1e30, math.inf])
 def test_extreme_densities(backend: Backend, sigma: float) -> None:
-    depth, near = ended(backend, FOLDED, round_of((4, 4)), torch.full((8,), sigma), 1e-3)
+    depth, near = ended(backend, CONTRACTED, round_of((4, 4)), torch.full((8,), sigma), 1e-3)
     assert depth.isfinite().all() and torch.equal(near < 9, torch.full((2,), sigma < 1))
 
 
@@ -129,5 +129,5 @@ def test_one_round_stays_and_may_have_no_samples(backend: Backend) -> None:
         samples, order = backend.pack_rounds([round])
         assert all(torch.equal(one, other) for one, other in zip(samples, round, strict=True))
         assert order.tolist() == list(range(sum(counts)))
-    depth, near = ended(backend, FOLDED, round_of((0, 0)), torch.zeros(0), 0.1)
+    depth, near = ended(backend, CONTRACTED, round_of((0, 0)), torch.zeros(0), 0.1)
     assert depth.tolist() == [0.5, 0.5] and near.tolist() == [9, 9]

@@ -13,10 +13,8 @@ import pytest
 from PIL import Image
 
 from pipeline.cli.commands import run_command
-from pipeline.engine.runner import Runner
 from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import default_workspace
-from stages.contract import StageError
 
 
 def test_help_names_every_command_and_stage(capsys: pytest.CaptureFixture[str]):
@@ -315,22 +313,6 @@ def test_photos_now_unusable_fail_their_own_stage(tmp_path: Path, capsys: pytest
         photo.rename(photo.with_suffix(".txt"))
     assert run_command(["resume", str(tmp_path / "w.nerf")]) == 10
     assert f"no photos in {tmp_path / 'photos'}" in capsys.readouterr().err
-
-
-def test_a_photo_now_unreadable_fails_its_reader(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    (tmp_path / "photos").mkdir()
-    for k in range(3):
-        Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")
-    assert run_on(tmp_path / "photos", capsys, "--until", "ingest")[0] == 0
-
-    def unreadable(_: Runner) -> str:
-        raise StageError("ingest.cannot-read", "cannot read 1.png", "Permission denied", "Check its permissions.")
-
-    monkeypatch.setattr(Runner, "_photos_digest", unreadable)
-    assert run_command(["resume", str(tmp_path / "w.nerf")]) == 10
-    assert "cannot read 1.png" in capsys.readouterr().err
 
 
 def test_status_of_no_workspace(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

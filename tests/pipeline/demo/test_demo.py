@@ -1,4 +1,3 @@
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,8 @@ from nerf.geometry.rays import rays_of_view
 from nerf.geometry.scene import Camera
 from nerf.synthetic.scenes import still_life
 from pipeline import demo
-from pipeline.cli.commands import command_demo, run_command
+from pipeline.cli.commands import run_command
 from pipeline.demo.truth import Truth
-from pipeline.engine.settings import Settings
 from stages.sfm.colmap.cameras import camera_rays
 from tests.refusals import refused
 from tests.synthetic_photos import SyntheticPhotos
@@ -82,22 +80,3 @@ def test_a_photo_shows_what_the_true_camera_sees(synthetic_photos: SyntheticPhot
 
 def test_the_demo_trains_for_a_bounded_time():
     assert demo.default_settings().train.seconds == demo.TRAIN_SECONDS < 200
-
-
-def test_the_demo_leaves_a_study_as_it_was_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    seen: list[float] = []
-
-    def run_stages(_root: Path, settings: Settings, *_: object, **__: object) -> int:
-        seen.append(settings.tradeoff.seconds)
-        return 1
-
-    workspace = tmp_path / "demo.nerf"
-    workspace.mkdir()
-    run = {"version": 2, "options": {"tradeoff": {"seconds": 1200}}, "plans": {}, "keys": {}}
-    (workspace / "run.json").write_text(json.dumps(run))
-    monkeypatch.setattr("pipeline.cli.commands._run_stages", run_stages)
-    monkeypatch.setattr("pipeline.demo.photograph", lambda photos, display: ("made", 0.0))
-    monkeypatch.setattr("pipeline.cli.commands.with_source", lambda settings, *_: settings)
-    monkeypatch.setattr("pipeline.demo.truth_lines", lambda *_: ["compared"])
-    assert command_demo(["-o", str(tmp_path)]) == 1
-    assert seen == [1200]

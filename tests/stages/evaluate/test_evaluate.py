@@ -190,11 +190,10 @@ def test_photos_are_scored_at_their_own_size_whatever_was_trained(make: Make, tm
     assert smaller["psnr"] != metrics["psnr"]
 
 
-def test_large_photos_are_scored_at_1600_pixels(make: Make, tmp_path: Path, progress: Any, monkeypatch: Any):
-    monkeypatch.setattr("stages.train.data.MAX_SCORED_SIDE", 60)
-    metrics, line = _run(make(scale=3), tmp_path / "out", progress)
-    assert (metrics["photo_size"], metrics["scored_size"]) == ([96, 72], [60, 45])
-    assert line.endswith("· 4 photos at 60 × 45 (trained at 96 × 72)")
+def test_large_photos_are_scored_at_1600_pixels(make: Make, tmp_path: Path, progress: Any):
+    metrics, line = _run(make(scale=54), tmp_path / "out", progress, fraction=0.01)
+    assert (metrics["photo_size"], metrics["scored_size"]) == ([1728, 1296], [1600, 1200])
+    assert line.endswith("4 photos at 1600 × 1200 (trained at 1728 × 1296)")
 
 
 class NoisyField(SkyField):

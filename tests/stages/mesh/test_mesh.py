@@ -123,7 +123,7 @@ def test_a_ball_becomes_a_closed_ball_in_the_sfm_frame(run_mesh, progress):
         assert 0 < abs(loaded.volume / (4 / 3 * np.pi * (radii.mean() / 0.25) ** 3) - 1) < 0.02
         expected = np.rint(255 * (0.5 + in_scene / 1.8))
         assert np.abs(colours_of(loaded) - expected).max() <= 255 * VOXEL / 1.8, "those of a grid cell away, at most"
-    assert any("surface at density" in note for note in progress.notes)
+    assert "mesh.iso-level" in progress.codes
     assert any("density at 48³ points" in message for message, _ in progress.updates)
 
 
@@ -305,7 +305,7 @@ def test_fog_becomes_a_mesh_that_says_it_is_fog(run_mesh, progress):
     result, _ = run_mesh(Solid(ball, inside=0.3))
     assert result.facts["faces"] > 100 and result.facts["surface_error_voxels"] is None
     assert result.line.endswith("; the field has no clear surface yet, train for longer")
-    assert any("still fog" in note for note in progress.notes)
+    assert progress.names("mesh.iso-level", "fog")
 
 
 def test_the_level_asked_for_is_taken(run_mesh):

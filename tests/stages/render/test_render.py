@@ -154,10 +154,9 @@ def test_odd_widths_are_rounded_whatever_else_is_given(inputs, progress, tmp_pat
 def test_plan_answers_every_open_question(inputs, progress) -> None:
     config = render.plan(render.Config(), inputs, progress)
     assert (config.path, config.frames, config.width, config.fps) == ("orbit", 6, 140, 2)
-    words = "30 k rays/s here: 6 frames 140×104 take about 2.9 s, training took 10 s"
-    assert progress.notes == [f"{words}; more would take too long: use --render.frames and --render.width to get it"]
+    assert progress.names("render.size", "30 k rays/s", "6 frames 140×104", "2.9 s", "10 s", "--render.frames")
     assert render.plan(config, inputs, progress) == config
-    assert len(progress.notes) == 1
+    assert progress.codes == ["render.size"]
 
 
 @pytest.mark.parametrize(("seconds", "frames"), [(0.02, 6), (10.0, 6), (60.0, 27), (1000.0, 120)])
@@ -174,10 +173,8 @@ def test_a_video_that_must_take_longer_than_training_says_so(inputs, progress) -
     write_json(inputs["train"] / "curve.json", {"points": [{"seconds": 0.1}]})
     render.plan(render.Config(), inputs, progress)
     render.plan(render.Config(frames=50), inputs, progress)
-    assert [note.split("; ")[1] for note in progress.notes] == [
-        "that is longer, but there is no smaller video",
-        "that is longer, as requested",
-    ]
+    assert progress.codes == ["render.size"] * 2
+    assert "no smaller video" in progress.notes[0] and "as requested" in progress.notes[1]
 
 
 def test_nothing_is_timed_where_nothing_is_open(inputs, progress) -> None:
@@ -372,24 +369,24 @@ def test_a_field_with_exposure_is_rendered_at_a_stated_one(
 def test_a_field_without_exposure_says_nothing_of_it(inputs, progress) -> None:
     result = run(inputs, progress, frames=2, width=40)
     assert "appearance" not in result.facts and "expos" not in result.line
-    progress.notes.clear()
+    progress.clear()
     assert "appearance" not in run(inputs, progress, frames=2, width=40, match_exposure="3.jpg").facts
-    assert progress.notes == ["the field has no exposure model: all photos, including 3.jpg, get the same exposure"]
+    assert progress.codes == ["render.no-exposure"] and progress.names("render.no-exposure", "3.jpg")
 
 
 @pytest.mark.parametrize(
     ("like", "level", "words", "note"),
     [
-        ("0.jpg", 0.6858, "exposed as estimated for 0.jpg", "0.jpg is not a training photo: its exposure is estimated"),
-        ("81.jpg", 0.5, NEUTRAL, f"there is no registered photo 81.jpg: {NEUTRAL}; did you mean 8.jpg"),
+        ("0.jpg", 0.6858, "exposed as estimated for 0.jpg", ("render.expected-exposure", "0.jpg")),
+        ("81.jpg", 0.5, NEUTRAL, ("render.no-such-photo", "81.jpg", NEUTRAL, " 8.jpg")),
     ],
 )
 def test_missing_exposure_is_no_error_after_training(
-    inputs, progress, monkeypatch, like: str, level: float, words: str, note: str
+    inputs, progress, monkeypatch, like: str, level: float, words: str, note: tuple[str, ...]
 ) -> None:
     with_exposure(inputs, monkeypatch)
     result = run(inputs, progress, frames=2, width=40, match_exposure=like, save_frames=True)
-    assert result.facts["appearance"] == words and progress.notes[-1].startswith(note)
+    assert result.facts["appearance"] == words and progress.names(*note)
     frame = np.asarray(Image.open(inputs["render"] / "frames/00000.png"))
     assert np.abs(frame[15, 20] / 255 - level).max() < 0.004
 

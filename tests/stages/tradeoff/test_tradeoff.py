@@ -12,10 +12,9 @@ import torch
 from PIL import Image
 
 from nerf.geometry.scene import Camera
-from stages import evaluate, tradeoff, train
+from stages import tradeoff, train
 from stages.contract import StageError, run_stage
 from stages.effects.decisions import Decisions, write_decisions
-from stages.evaluate import tiles
 from stages.evaluate.tiles import MIN_TILES
 from stages.io import stopwatch
 from stages.io.files import read_json, read_scene, write_json
@@ -185,7 +184,7 @@ def test_a_slow_machine_leaves_arms_out_and_names_them(
     assert len(content["left_out"]) > len(
         study.schedule_of(Config.model_validate(CONFIG | {"speeds": SPEEDS})).left_out
     )
-    assert any("slower than when it was measured" in note for note in progress.notes)
+    assert progress.names("tradeoff.not-trained", "slower")
 
 
 def test_what_a_killed_attempt_took_is_time_of_the_study(
@@ -196,10 +195,9 @@ def test_what_a_killed_attempt_took_is_time_of_the_study(
         studied(tmp_path, photos, progress)
     studied(tmp_path, photos, progress)
     assert 0.9 * CONFIG["seconds"] < now[0] - 100 <= 1.1 * CONFIG["seconds"]
-    first, again = (note for note in progress.notes if "runs" in note and "until" in note)
+    first, again = (note for note in progress.said("tradeoff.schedule") if "until" in note)
     assert " runs: about " in first and " runs, 3 of them done: about " in again
-    assert any(note.startswith("no time is left; not trained: ") for note in progress.notes)
-    assert not any("slower" in note for note in progress.notes), "the kill took the time"
+    assert progress.names("tradeoff.not-trained", "no time"), "the kill took the time"
 
 
 def test_a_study_out_of_time_still_has_a_result(
@@ -297,7 +295,7 @@ def test_a_run_that_does_not_learn_is_told(
     assert f" 1 of {len(content['runs'])} runs without a result · " in result.line
     assert "no positional encoding" not in {row["variant"] for row in content["points"]}
     assert [a["failed"] for a in content["runs"] if a["failed"]] == ["training diverged: it was told to"]
-    assert any("no result (training diverged: it was told to)" in note for note in progress.notes)
+    assert progress.names("tradeoff.result", "training diverged: it was told to")
 
 
 def test_lack_of_memory_ends_and_resumes_the_study(
@@ -356,20 +354,6 @@ def test_tiles_are_parts_of_all_test_photos(photos: dict[str, Path]) -> None:
             rows, columns = slice(16 * number, 16 * number + 16), slice(left, left + 16)
             assert torch.equal(crop.truth[rows], truth[:, columns])
             assert torch.equal(crop.rays.directions[rows], rays.directions[:, columns])
-
-
-def test_a_study_scores_as_evaluate_does(
-    tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tiles, "TILE_SIZE", 8)  # six cover a photo of 24 × 16 without overlap
-    own, scored = tmp_path / "train", tmp_path / "evaluate"
-    for folder in (own, scored):
-        folder.mkdir()
-    run_stage(train, train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, own, progress)
-    facts = run_stage(evaluate, evaluate.Config(fraction=1), photos | {"train": own}, scored, progress).facts
-    made = benchmark.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), None, 1000, 2.0)
-    figures = benchmark.score(own, made, progress)
-    assert figures["psnr"] == pytest.approx(facts["psnr"], abs=0.001)
 
 
 def test_large_photos_among_small_ones_are_drawn_small_and_whole(

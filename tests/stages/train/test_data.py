@@ -1,5 +1,4 @@
 import weakref
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ from hypothesis import strategies as st
 
 from nerf.geometry.scene import Camera
 from nerf.training.ray_dataset import PosedViews, make_ray_dataset
-from stages.contract import StageError
 from stages.depth.consistency import DepthMap
 from stages.depth.files import depth_map_file, write_depth_map
 from stages.io.files import write_png, write_tensors
@@ -31,6 +29,7 @@ from stages.train.data import (
     view_rays,
 )
 from tests.conftest import SilentProgress
+from tests.refusals import refused
 from tests.stages.photo_scene import CAMERA, FOCAL, HEIGHT, RADIUS, WIDTH, ball_photo, photographed, seen_points
 
 
@@ -147,24 +146,6 @@ def test_pixel_store_is_asked_once_a_split(tmp_path: Path, monkeypatch: pytest.M
     assert sorted(asked) == ["test", "train"]
 
 
-@pytest.mark.parametrize("downscale", [1.0, 8.0])
-@pytest.mark.parametrize("has_alpha", [True, False])  # of the scene: where it has none, that of photos is dropped
-def test_parallel_decoding_follows_the_files_sizes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, progress: SilentProgress, has_alpha: bool, downscale: float
-) -> None:
-    def pool(workers: int) -> ThreadPoolExecutor:
-        asked.append(workers)
-        return ThreadPoolExecutor(workers)
-
-    asked = list[int]()
-    inputs, scene = photographed(tmp_path, channels=4)
-    monkeypatch.setattr("stages.io.pixels.processors", lambda: 16)
-    monkeypatch.setattr("stages.io.pixels.DECODING_BYTES", 2 * 80 * WIDTH * HEIGHT)
-    monkeypatch.setattr("stages.io.pixel_store.ThreadPoolExecutor", pool)
-    training_dataset(inputs["ingest"], replace(scene, has_alpha=has_alpha), "train", downscale, progress)
-    assert asked == [2]
-
-
 LENSES = {
     "none": Camera("PINHOLE", 4000, 3000, (3000.0, 3000.0, 2010.0, 1490.0)),
     "phone": Camera("SIMPLE_RADIAL", 4000, 3000, (3000.0, 2000.0, 1500.0, 0.1)),
@@ -210,7 +191,7 @@ def test_a_reduced_pixel_is_used_where_all_it_covers_is(
     assert torch.equal(used, (torch.arange(width) < columns).expand(height, width))
     dataset = training_dataset(inputs["ingest"], scene, "train", downscale, progress)
     assert (dataset.unmasked_count, len(dataset.pixels)) == (6 * height * columns, 6 * height * width)
-    assert progress.notes[-1] == f"masks leave {columns / width:.0%} of the pixels of the train photos"
+    assert progress.codes[-1] == "train.masked" and progress.names("train.masked", f"{columns / width:.0%}", "training")
 
 
 def test_masks_are_loaded_a_few_at_a_time_and_dropped(
@@ -254,12 +235,8 @@ def test_masks_that_leave_nothing_at_a_size_are_said(tmp_path: Path, progress: S
     mask[4, 4] = 255
     inputs, scene = photographed(tmp_path, mask=mask)
     assert training_dataset(inputs["ingest"], scene, "train", 1.0, progress).unmasked_count == 6
-    with pytest.raises(StageError) as error:
+    with refused("train.all-masked", "training photos", "--train.downscale"):
         training_dataset(inputs["ingest"], scene, "train", 2.0, progress)
-    assert str(error.value) == (
-        "nothing is left to train on: the masks ignore every pixel of the train photos at this size. "
-        "Give a smaller --train.downscale."
-    )
 
 
 @pytest.mark.parametrize("downscale", [1.0, 2.0, 3.3])

@@ -40,7 +40,7 @@ def test_killed_and_resumed_is_the_same_as_uninterrupted(tmp_path: Path, progres
     assert torch.equal(number_of(whole).value, number_of(resumed).value)
     spent = [(run.state.step, run.state.rays, run.state.colour_evaluations) for run in (whole, resumed)]
     assert spent == 2 * [(40, 160, 480)]
-    assert "resuming from step 20 of 40" in progress.notes
+    assert progress.names("train.resumes", "step 20 of 40")
 
 
 def test_finished_and_run_again_does_nothing(tmp_path: Path, progress) -> None:
@@ -67,7 +67,7 @@ def test_a_non_finite_step_is_rolled_back(tmp_path: Path, progress) -> None:
     assert {rate for step, _, rate in number_of(run).history if step > 25} == {0.25}
     assert [e["step"] for e in events(tmp_path) if e["event"] == "nonfinite"] == [25, 25]
     assert (tmp_path / "nonfinite_25.safetensors").is_file()
-    assert "the loss of step 25 is not finite: back to step 25 at half the learning rate" in progress.notes
+    assert progress.names("train.rolled-back", "the loss of step 25", "back to step 25")
 
 
 def test_after_three_roll_backs_training_fails_by_name(tmp_path: Path, progress) -> None:
@@ -109,7 +109,7 @@ def test_a_collapsed_field_is_restarted_with_another_seed(
     run = run_in(tmp_path, progress, make=dying(2, opacity, grey))
     run.train()
     assert (run.state.restarts, run.state.step, number_of(run).seed) == (2, 40, 2)
-    assert progress.notes == [f"after 10 steps the field has collapsed: {reason}; restarting with another seed"] * 2
+    assert progress.codes == ["train.restarted"] * 2 and progress.names("train.restarted", "10 steps", reason)
 
 
 def test_a_field_that_stays_collapsed_fails_by_name(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -194,7 +194,7 @@ def test_more_steps_begin_at_the_longer_runs_rates(tmp_path: Path, progress) -> 
     curve = [point["step"] for point in longer.state.curve]
     assert curve == sorted(set(curve)) and curve[-1] == 60 and 40 in curve, "one curve over both"
     assert before == {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
-    assert "continuing the finished training from step 40 to step 60" in progress.notes
+    assert progress.names("train.more", "step 40 to step 60")
 
 
 def test_more_steps_in_two_pieces_are_the_same_bytes(tmp_path: Path, progress) -> None:

@@ -35,7 +35,7 @@ def test_a_resumed_run_in_seconds_keeps_its_clock(tmp_path: Path, progress) -> N
     assert [list(decision) for decision in resumed.schedule.revisions][: len(journal)] == journal
     assert number_of(resumed).history[0][:2] == (30, resumed.schedule.progress(30))
     assert 0.2 < resumed.state.seconds < 0.5
-    assert any(note.startswith("resuming from step 30, with 0 s of training left") for note in progress.notes)
+    assert progress.names("train.resumes", "step 30", "0 s")
 
 
 def test_more_seconds_take_about_that_long(tmp_path: Path, progress) -> None:
@@ -96,8 +96,7 @@ def test_what_a_kill_loses_is_spent(
     assert 29 + again == pytest.approx(60, abs=2.5), "it is all spent, however slow the machine is now"
     shares = [share for _, share, _ in number_of(run).history]
     assert shares == sorted(shares) and 0.9 < shares[-1] <= 1
-    lost = [note for note in progress.notes if "after the last checkpoint are lost and count as spent" in note]
-    assert len(lost) == (29 - checkpoint.facts["seconds"] > 1.6)
+    assert progress.codes.count("train.lost-time") == (29 - checkpoint.facts["seconds"] > 1.6)
 
 
 def test_a_repeatedly_killed_run_has_half_its_time(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:

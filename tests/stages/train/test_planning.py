@@ -117,8 +117,8 @@ def test_the_speed_is_measured_on_this_machine(config: Config, tmp_path: Path, m
 def test_a_budget_of_steps_is_counted_not_timed(scene: Scene) -> None:
     assert rays_in_budget(VANILLA.model_copy(update={"steps": 5, "seconds": None}), scene, Decisions()) == 5 * 64
     spaces = [GRID.model_copy(update={"space": space}) for space in ("bounded", "contracted")]
-    in_box, folded = (rays_in_budget(config, scene, Decisions()) for config in spaces)
-    assert 100 * 4096 / 100 < folded < in_box < 100 * 4096
+    in_box, contracted = (rays_in_budget(config, scene, Decisions()) for config in spaces)
+    assert 100 * 4096 / 100 < contracted < in_box < 100 * 4096
 
 
 def sizes_of(config: Config, scene: Scene, rays: float, progress: Progress | None = None) -> dict[str, int]:
@@ -131,8 +131,13 @@ def sizes_in(grid: HashGridOptions) -> dict[str, int]:
 
 
 @given(st.floats(1e3, 1e9), st.floats(1, 100), st.floats(1, 20), st.booleans())
-def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: float, down: float, folded: bool) -> None:
-    sized, config = of_size(scene, 3000, 2000), GRID.model_copy(update={"space": "contracted" if folded else "bounded"})
+def test_grids_grow_with_rays_and_pixels(
+    scene: Scene, rays: float, factor: float, down: float, contracted: bool
+) -> None:
+    sized, config = (
+        of_size(scene, 3000, 2000),
+        GRID.model_copy(update={"space": "contracted" if contracted else "bounded"}),
+    )
 
     def chosen(rays: float, downscale: float) -> dict[str, int]:
         return sizes_of(config.model_copy(update={"downscale": downscale}), sized, rays)
@@ -143,19 +148,19 @@ def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: floa
     assert isinstance(field, HashGridSettings)
     assert 128 <= field.max_res <= 1024
     # Two neighbouring samples lie in the same or in neighbouring cells of the finest grid, near the cameras at least.
-    cells_per_step = field.stepping.step_size * field.max_res / (4 if folded else 1.8)
-    in_folded_space = 1 / 3 if field.max_res <= 512 else 2 / 3
+    cells_per_step = field.stepping.step_size * field.max_res / (4 if contracted else 1.8)
+    in_contracted_space = 1 / 3 if field.max_res <= 512 else 2 / 3
     assert cells_per_step == pytest.approx(
-        in_folded_space if folded else max(1, math.sqrt(3) * field.max_res / 576), rel=0.01
+        in_contracted_space if contracted else max(1, math.sqrt(3) * field.max_res / 576), rel=0.01
     )
 
 
-@pytest.mark.parametrize(("folded", "most"), [(True, 2048), (False, 1024)])
+@pytest.mark.parametrize(("contracted", "most"), [(True, 2048), (False, 1024)])
 def test_a_gpu_has_larger_fields_and_takes_larger_steps(
-    scene: Scene, folded: bool, most: int, monkeypatch: pytest.MonkeyPatch
+    scene: Scene, contracted: bool, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     grid = HashGridOptions(micro_batches=2)
-    config = Config(grid=grid, space="contracted" if folded else "bounded", view_dependence=True, downscale=1.0)
+    config = Config(grid=grid, space="contracted" if contracted else "bounded", view_dependence=True, downscale=1.0)
     large = of_size(scene, 4000, 3000)
     on_cpu = sizes_of(with_defaults(config), large, 1e9), with_defaults(config)
     monkeypatch.setattr("stages.train.fields.hash_grid.compute_device", lambda: "cuda")
@@ -164,30 +169,32 @@ def test_a_gpu_has_larger_fields_and_takes_larger_steps(
     assert on_gpu[0] == {"num_levels": 8, "log2_hashmap_size": 20, "max_res": most}
     assert all(on_gpu[0][name] > on_cpu[0][name] for name in ("max_res", "log2_hashmap_size"))
     assert sizes_of(with_defaults(config), large, 1e6) == {
-        "num_levels": 5 if folded else 4,
+        "num_levels": 5 if contracted else 4,
         "log2_hashmap_size": 17,
-        "max_res": 512 // (2 - folded),
+        "max_res": 512 // (2 - contracted),
     }
     assert (on_gpu[1].grid.target_samples, on_gpu[1].learning_rate) == (1 << 18, 2e-2)
     assert (on_cpu[1].grid.target_samples or 0) < 1 << 16
     few = with_defaults(with_grid(config, target_samples=1 << 14))
-    assert few.learning_rate == (1e-2 if folded else 2e-2)
+    assert few.learning_rate == (1e-2 if contracted else 2e-2)
 
 
-@pytest.mark.parametrize("folded", [True, False])
-def test_every_core_has_an_equal_part(folded: bool) -> None:
+@pytest.mark.parametrize("contracted", [True, False])
+def test_every_core_has_an_equal_part(contracted: bool) -> None:
     parts = [
-        with_defaults(with_grid(Config(space="contracted" if folded else "bounded"), micro_batches=count))
+        with_defaults(with_grid(Config(space="contracted" if contracted else "bounded"), micro_batches=count))
         for count in (1, 2, 64)
     ]
     sizes = [part.grid.target_samples or 0 for part in parts]
-    assert sizes == [MICRO_BATCH_SAMPLES["contracted" if folded else "bounded"], 2 * sizes[0], MAX_STEP_SAMPLES]
+    assert sizes == [MICRO_BATCH_SAMPLES["contracted" if contracted else "bounded"], 2 * sizes[0], MAX_STEP_SAMPLES]
     assert parts[2].learning_rate == LARGE_STEP_LEARNING_RATE >= (parts[1].learning_rate or 1)
 
 
 def test_samples_follow_occupied_cells() -> None:
-    folded = Config(space="contracted", view_dependence=True, grid=HashGridOptions(num_levels=1, log2_hashmap_size=8))
-    sizes = (with_grid(folded, max_res=max_res) for max_res in (256, 512, 700, 1024, 2048, 4096))
+    contracted = Config(
+        space="contracted", view_dependence=True, grid=HashGridOptions(num_levels=1, log2_hashmap_size=8)
+    )
+    sizes = (with_grid(contracted, max_res=max_res) for max_res in (256, 512, 700, 1024, 2048, 4096))
     fields = [field_settings(config, sky=False) for config in sizes]
     steps = [field.min_step_size for field in fields]
     assert steps == [4 / 768, 4 / 1536, 4 / 1536, 4 / 1536, 4 / 3072, 4 / 3072]
@@ -221,12 +228,12 @@ def test_the_reason_for_sizes_is_the_budget() -> None:
     assert reason(VANILLA, 950).startswith("10 s on this machine render about 950 rays")
 
 
-FOLDED = GRID.model_copy(update={"space": "contracted", "downscale": 1.0})
+CONTRACTED = GRID.model_copy(update={"space": "contracted", "downscale": 1.0})
 LARGEST, SMALLEST = (
     {"num_levels": levels, "log2_hashmap_size": log2_size, "max_res": max_res}
     for levels, log2_size, max_res in ((6, 18, 1024), (5, 17, 512))
 )
-NEEDED = memory_bytes(with_grid(FOLDED, **LARGEST), 1)
+NEEDED = memory_bytes(with_grid(CONTRACTED, **LARGEST), 1)
 
 
 @pytest.mark.parametrize(
@@ -242,7 +249,7 @@ def test_grids_take_half_of_the_free_memory_at_most(
     scene: Scene, free: float, own: dict[str, int], chosen: dict[str, int], monkeypatch: pytest.MonkeyPatch, progress
 ) -> None:
     monkeypatch.setattr("stages.train.fields.hash_grid.available_on", {"cpu": free}.get)
-    config = with_grid(FOLDED, **own)
+    config = with_grid(CONTRACTED, **own)
     assert sizes_of(config, of_size(scene, 4000, 3000), 1e9, progress) == chosen | own
     assert progress.codes == ["train.memory-limits-grids"] * (chosen is not LARGEST)
     got = f"5 grids of up to 2^{chosen['log2_hashmap_size']} rows"

@@ -171,7 +171,15 @@ def test_a_grid_field_that_diverges_is_rolled_back(tmp_path: Path, progress, mon
 def test_an_empty_hash_grid_field_is_given_up(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs, _ = photographed(tmp_path, channels=4)
     monkeypatch.setattr("stages.train.loop.MIN_HEALTHY_STEPS", 3)
-    monkeypatch.setattr("nerf.fields.mlp.sigma_of", lambda geometry: 0 * geometry[:, 0])
+    step = HashGridTrainer.step
+
+    def emptied(self: HashGridTrainer, number: int, *rest: float):
+        result = step(self, number, *rest)
+        for part, value in ((self.model.table, 1.0), (self.model.density_hidden, 1.0), (self.model.density_out, -99.0)):
+            part.fill_(value)
+        return result
+
+    monkeypatch.setattr(HashGridTrainer, "step", emptied)
     with refused("train.collapsed", "after 3 steps", "empty", "3 different seeds"):
         trained(tmp_path / "train", inputs, progress, field="grid", steps=20)
 

@@ -11,7 +11,7 @@ from nerf.kernels.torch.marching import s_to_t, t_to_s
 from nerf.kernels.torch.occupancy import binary_occupancy
 
 BOUNDED = RayStepping(step_size=0.05, cone_angle=0.0, contracted=False, occupancy_resolution=8, max_samples=1000)
-FOLDED = RayStepping(step_size=0.05, cone_angle=0.1, contracted=True, occupancy_resolution=8, max_samples=1000)
+CONTRACTED = RayStepping(step_size=0.05, cone_angle=0.1, contracted=True, occupancy_resolution=8, max_samples=1000)
 FULL = binary_occupancy(torch.full((8,), -1))
 
 
@@ -53,13 +53,13 @@ def test_the_lattice_is_the_solution_of_its_equation() -> None:
     torch.testing.assert_close(samples.dt, slow[:, 1], rtol=1e-4, atol=0)
 
 
-@pytest.mark.parametrize("stepping", [BOUNDED, FOLDED])
+@pytest.mark.parametrize("stepping", [BOUNDED, CONTRACTED])
 def test_distance_and_coordinate_undo_each_other(stepping: RayStepping) -> None:
     t = torch.logspace(-6, 3, 50, dtype=torch.float64)
     torch.testing.assert_close(s_to_t(stepping, t_to_s(stepping, t)), t)
 
 
-@pytest.mark.parametrize("stepping", [BOUNDED, FOLDED])
+@pytest.mark.parametrize("stepping", [BOUNDED, CONTRACTED])
 def test_intervals_of_a_full_cache_tile_each_ray(stepping: RayStepping) -> None:
     rays = random_rays()
     samples = march(FULL, stepping, rays, torch.zeros(50, dtype=torch.float64))
@@ -117,12 +117,12 @@ def test_an_empty_cache_or_no_rays_give_no_samples() -> None:
     nothing = march(binary_occupancy(torch.zeros(8, dtype=torch.int64)), BOUNDED, rays, jitter_of(rays))
     assert (nothing.starts.tolist(), len(nothing.t)) == ([0, 0, 0, 0], 0)
     none = rays.each(lambda part: part[:0])
-    assert march(FULL, FOLDED, none, jitter_of(none)).starts.tolist() == [0]
+    assert march(FULL, CONTRACTED, none, jitter_of(none)).starts.tolist() == [0]
 
 
 def test_unit_coordinates_are_the_box_or_all_of_space() -> None:
     rays = random_rays()
-    for stepping in (BOUNDED, FOLDED):
+    for stepping in (BOUNDED, CONTRACTED):
         samples = march(FULL, stepping, rays, jitter_of(rays))
         points = sample_points(rays, samples, stepping.contracted)
         assert 0 <= points.min() < 0.1 and 0.9 < points.max() <= 1
@@ -131,7 +131,7 @@ def test_unit_coordinates_are_the_box_or_all_of_space() -> None:
         torch.testing.assert_close(points, wanted)
 
 
-@pytest.mark.parametrize("stepping", [BOUNDED, FOLDED])
+@pytest.mark.parametrize("stepping", [BOUNDED, CONTRACTED])
 def test_gradients_reach_origins_and_directions(stepping: RayStepping) -> None:
     rays = random_rays(8)
     samples = march(FULL, stepping, rays, jitter_of(rays))
@@ -145,7 +145,7 @@ def test_gradients_reach_origins_and_directions(stepping: RayStepping) -> None:
 
 def test_folded_points_far_away_have_a_finite_gradient() -> None:
     rays = Rays(torch.zeros(1, 3), torch.tensor([[0.6, 0.0, 0.8]]), torch.tensor([1e-3]), torch.tensor([1e12]))
-    samples = march(FULL, FOLDED, rays, torch.tensor([0.5]))
+    samples = march(FULL, CONTRACTED, rays, torch.tensor([0.5]))
     gradients = sample_points_backward(rays, samples, True, torch.ones(len(samples.t), 3))
     assert samples.t[-1] > 1e11
     assert all(gradient.isfinite().all() for gradient in gradients)

@@ -12,7 +12,7 @@ from nerf.kernels.torch.marching import t_to_s, unit_coordinates
 from nerf.kernels.torch.occupancy import binary_occupancy, cell_corners, cell_numbers
 from tests.nerf.kernels.agreement import (
     BOUNDED,
-    FOLDED,
+    CONTRACTED,
     STEPPINGS,
     TOLERANCE,
     agree,
@@ -86,7 +86,7 @@ def test_marching_stops_at_the_cap(device: str, most: int, stepping: RayStepping
 
 
 @pytest.mark.parametrize(
-    "stepping", [BOUNDED._replace(step_size=2e-4), FOLDED._replace(step_size=5e-4, cone_angle=1e-3)], ids=STEPPINGS
+    "stepping", [BOUNDED._replace(step_size=2e-4), CONTRACTED._replace(step_size=5e-4, cone_angle=1e-3)], ids=STEPPINGS
 )
 @pytest.mark.parametrize("kind", ["random", "full"])
 def test_marching_of_4096_samples(device: str, kind: str, stepping: RayStepping) -> None:
@@ -100,7 +100,7 @@ def test_marching_from_far_away_in_folded_space(device: str) -> None:
     origins = rays.origins * torch.logspace(0, 6, 320)[:, None]
     samples = assert_same_march(
         occupied_of(device, "full", 16),
-        FOLDED._replace(occupancy_resolution=16),
+        CONTRACTED._replace(occupancy_resolution=16),
         rays._replace(origins=origins),
         uniform(device, 8, 320),
     )
@@ -145,7 +145,7 @@ def test_sample_points(device: str, contracted: bool) -> None:
     rays = random_rays(device, 320)
     if contracted:
         rays = rays._replace(origins=rays.origins * torch.logspace(0, 6, 320)[:, None])
-    stepping = FOLDED if contracted else BOUNDED
+    stepping = CONTRACTED if contracted else BOUNDED
     samples = warp.march(occupied_of(device, "random", 32), stepping, rays, uniform(device, 8, 320))
     points = agree("sample_points", rays, samples, contracted)
     assert points.min() > -1e-6 and points.max() < 1 + 1e-6
@@ -155,7 +155,7 @@ def test_sample_points(device: str, contracted: bool) -> None:
 def test_gradients_of_sample_points(device: str, contracted: bool) -> None:
     """Ray by ray, as they fall with the square of the distance."""
     rays = random_rays(device, 320, far=1e3)
-    stepping = FOLDED if contracted else BOUNDED
+    stepping = CONTRACTED if contracted else BOUNDED
     samples = warp.march(occupied_of(device, "random", 32), stepping, rays, uniform(device, 8, 320))
     grad = normal(device, 12, len(samples.t), 3)
     given = warp.sample_points_backward(rays, samples, contracted, grad)

@@ -20,8 +20,8 @@ from nerf.kernels.warp.launch import launch
 from tests.devices import skip_without
 from tests.nerf.kernels.agreement import (
     BOUNDED,
+    CONTRACTED,
     COUNTS,
-    FOLDED,
     TOLERANCE,
     agree,
     assert_each_close,
@@ -267,7 +267,7 @@ def test_no_rays_and_no_samples_are_fine_even_at_first(device: str, rays: int) -
         samples, empty, none = packed(device, counts), torch.zeros(0, device=device), torch.zeros(0, 3, device=device)
         nowhere, some = occupied_of(device, "empty", 32), random_rays(device, 320)
         few = some.each(lambda part: part[:rays])
-        for stepping in (BOUNDED, FOLDED):
+        for stepping in (BOUNDED, CONTRACTED):
             marched = warp.march(nowhere, stepping, few, few.near)
             assert marched.starts.tolist() == [0] * (rays + 1) and len(marched.t) == 0
             agree("sample_points", few, samples, stepping.contracted)
@@ -282,7 +282,7 @@ def test_no_rays_and_no_samples_are_fine_even_at_first(device: str, rays: int) -
         agree("spherical_harmonics", few.directions)
         agree("pack_rounds", [samples, samples])
         depth, near = torch.zeros(rays, dtype=torch.float64, device=device), few.near.clone()
-        warp.finish_round(FOLDED, samples, empty, 0.5, few.near, few.far, depth, near)
+        warp.finish_round(CONTRACTED, samples, empty, 0.5, few.near, few.far, depth, near)
         assert torch.equal(near, few.far) and not depth.any()
         inputs = samples, empty, none, few.directions, few.far
         rendering, _ = agree("composite", *inputs)

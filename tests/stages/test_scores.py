@@ -1,0 +1,29 @@
+"""The score of a field is one figure, whichever stage computes it."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from stages import evaluate, train
+from stages.contract import run_stage
+from stages.evaluate import tiles
+from stages.io.files import read_scene
+from stages.tradeoff import benchmark
+from stages.train.fields.hash_grid_options import HashGridOptions
+from tests.stages.photo_scene import photographed
+
+GRID = HashGridOptions(num_levels=2, log2_hashmap_size=10, max_res=32, target_samples=1024)
+
+
+def test_a_study_scores_as_evaluate_does(tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiles, "TILE_SIZE", 8)  # six cover a photo of 24 × 16 without overlap
+    photos, _ = photographed(tmp_path / "photos", channels=4)
+    own, scored = tmp_path / "train", tmp_path / "evaluate"
+    for folder in (own, scored):
+        folder.mkdir()
+    run_stage(train, train.Config(steps=70, downscale=1.0, grid=GRID), photos, own, progress)
+    facts = run_stage(evaluate, evaluate.Config(fraction=1), photos | {"train": own}, scored, progress).facts
+    made = benchmark.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), None, 1000, 2.0)
+    figures = benchmark.score(own, made, progress)
+    assert figures["psnr"] == pytest.approx(facts["psnr"], abs=0.001)
