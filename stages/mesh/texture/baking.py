@@ -22,7 +22,7 @@ from stages.mesh.texture.photos import Photo, colours_at, projected, read_pictur
 from stages.mesh.texture.view_selection import Candidates, Choice
 
 LEVELLING_STEPS = 6  # over neighbours, of the differences between photos
-FACES_AT_ONCE = 1 << 14
+FACES_AT_ONCE = 1 << 12
 TEXELS_AT_ONCE = 1 << 22
 
 
@@ -45,11 +45,8 @@ def bake(
         light[texel] = _within(corner, rest[surface.faces[face]])
         covered[texel] = True
 
-    def part_of(index: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        return _part_of_photo(surface, atlas, photos[index], index, choice, means)
-
-    for index, part in enumerate(in_order(part_of, range(len(photos)), torch.device("cpu"))):
-        for texel, colour in part:
+    for index, photo in enumerate(photos):
+        for texel, colour in _of_photo(surface, atlas, photo, index, choice, means):
             light[texel] += colour
         on_photo((index + 1) / len(photos))
     picture = np.empty((atlas.height * atlas.width, 3), np.uint8)
@@ -61,32 +58,38 @@ def bake(
     return fill_gutters(picture.reshape(*shape, 3), covered.reshape(shape))
 
 
-def _part_of_photo(
+def _of_photo(
     surface: Surface, atlas: Atlas, photo: Photo, index: int, choice: Choice, means: csr_array
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """What a photo adds to the texture: texels, and colours (n, 3) float16 times what they weigh."""
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """What a photo adds to the texture: texels, and colours (n, 3) float32 times what they weigh. A block of faces at a
+    time on each core: all that a photo shows would take more memory than the texture."""
     weight = choice.weight(index)
     faces = np.flatnonzero(weight[surface.faces].any(axis=1))
     if len(faces) == 0:
-        return []
+        return
     picture = read_picture(photo, max(1.0, 1 / atlas.texels_per_pixel))
-    level, part = _levelling(choice.candidates, index, choice.colour, means), []
+    level = _levelling(choice.candidates, index, choice.colour, means)
     of_vertex = np.concatenate([surface.vertices, level, weight[:, None]], axis=1)
-    for face, texel, corner in _texels(atlas, faces):
-        here = _within(corner, of_vertex[surface.faces[face]])
-        colour = colours_at(photo, picture, projected(photo, here[:, :3]).pixels, here[:, :3])
-        part.append((texel, ((colour + here[:, 3:6]).clip(0, 1) * here[:, 6:]).astype(np.float16)))
-    return part
+
+    def of_block(some: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        part = []
+        for face, texel, corner in _texels(atlas, some):
+            here = _within(corner, of_vertex[surface.faces[face]])
+            colour = colours_at(photo, picture, projected(photo, here[:, :3]).pixels, here[:, :3])
+            part.append((texel, (colour + here[:, 3:6]).clip(0, 1) * here[:, 6:]))
+        return part
+
+    blocks = [faces[start : start + FACES_AT_ONCE] for start in range(0, len(faces), FACES_AT_ONCE)]
+    for part in in_order(of_block, blocks, torch.device("cpu")):
+        yield from part
 
 
 def _texels(atlas: Atlas, faces: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Of some faces: the face of each texel, the texel's flat index and its barycentric coordinates, in blocks."""
-    for start in range(0, len(faces), FACES_AT_ONCE):
-        some = faces[start : start + FACES_AT_ONCE]
-        corners = atlas.uv[atlas.corner[some]]
-        for index, row, column in covered_pixels(corners, atlas.width, atlas.height):
-            at = np.stack([column, row], axis=1) + 0.5
-            yield some[index], row * atlas.width + column, barycentric(corners[index], at)
+    corners = atlas.uv[atlas.corner[faces]]
+    for index, row, column in covered_pixels(corners, atlas.width, atlas.height):
+        at = np.stack([column, row], axis=1) + 0.5
+        yield faces[index], row * atlas.width + column, barycentric(corners[index], at)
 
 
 def _within(corner: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -1,6 +1,8 @@
 """Textures baked from photos of a surface whose colours are known, and what must not get into them."""
 
 import math
+import shutil
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -288,3 +290,26 @@ def test_files_hold_the_texture_the_right_way_up(shoot, baked, tmp_path):
         inner = (np.abs(np.asarray(loaded.vertices)[:, :2]) < 0.6).all(axis=1)
         difference = sampled_picture(picture, at)[inner] / 255 - pattern(np.asarray(loaded.vertices)[inner])
         assert inner.sum() > 20 and np.abs(difference).mean() < 0.03
+
+
+VALIDATE = """
+let validator
+try { validator = require("gltf-validator") } catch { process.exit(77) }
+const bytes = new Uint8Array(require("fs").readFileSync(process.argv[1]))
+validator.validateBytes(bytes).then(report => console.log(report.issues.numErrors, report.issues.numWarnings))
+"""
+
+
+@pytest.mark.parametrize("textured", [True, False])
+def test_khronos_validator_finds_no_fault(shoot, baked, tmp_path, textured):
+    """Needs Node.js and `npm install gltf-validator` in a folder that NODE_PATH names."""
+    if shutil.which("node") is None:
+        pytest.skip("node is not installed")
+    surface = sheet(8)
+    texture = baked(surface, shoot())[2].texture if textured else None
+    mesh = ColouredMesh(*surface, vertex_normals(surface), np.zeros((len(surface.vertices), 3), np.uint8), texture)
+    (tmp_path / "mesh.glb").write_bytes(glb_bytes(mesh, np.eye(3)))
+    done = subprocess.run(["node", "-e", VALIDATE, tmp_path / "mesh.glb"], capture_output=True, text=True)
+    if done.returncode == 77:
+        pytest.skip("npm's gltf-validator is not installed")
+    assert (done.stdout.split(), done.stderr) == (["0", "0"], "")
