@@ -10,12 +10,13 @@ from typing import Literal
 
 from pydantic import Field
 
-from stages.contract import Auto, Flexible, Inputs, Progress, StageConfig, StageResult, Workload
+from stages.contract import Auto, Flexible, Inputs, Progress, StageConfig, StageError, StageResult, Workload
 from stages.hardware.device import processors
 from stages.io.files import read_scene
+from stages.scale import metres_per_unit
 from stages.train import trained_seconds
 
-INPUTS = ("ingest", "normalise", "train")
+INPUTS = ("ingest", "normalise", "scale", "train")
 VERSION = 14
 EXIT_CODE = 17
 RESUMES = False
@@ -87,7 +88,13 @@ class Config(StageConfig):
         ),
     )
     formats: tuple[Format, ...] = Field(default=("glb", "ply"), min_length=1, description="File formats to write.")
-    frame: Literal["sfm", "scene"] = Field(default="sfm", description="Coordinate frame of the files.")
+    frame: Auto[Literal["metric", "sfm", "scene"]] = Field(
+        default=None,
+        description=(
+            "Coordinate frame of the files; metric is the sfm frame in metres (default: metric if the scale is known, "
+            "else sfm)."
+        ),
+    )
 
 
 def expected_seconds(config: Config, workload: Workload) -> float | None:
@@ -107,9 +114,18 @@ def _texture_seconds(config: Config, photos: int, cores: int) -> float:
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Choose the resolution: from the training, or from what a texture leaves of ``seconds`` and the speed of this
-    machine; and the number of faces."""
+    machine; the number of faces; and the frame."""
     from stages.mesh.resolution import choose_resolution
 
+    metres = metres_per_unit(inputs["scale"])
+    if config.frame == "metric" and metres is None:
+        raise StageError(
+            "mesh.no-metres",
+            "--mesh.frame metric needs a scale that is known",
+            "no marker, distance or GPS position tells how long a unit is",
+            "Give --scale.marker or --scale.distance, or leave --mesh.frame out.",
+        )
+    frame = config.frame or ("sfm" if metres is None else "metric")
     faces, resolution = TEXTURED_FACES if config.texture_size else COLOURED_FACES, config.resolution
     if resolution is None:
         seconds = config.seconds
@@ -117,7 +133,7 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
             photos = len(read_scene(inputs["normalise"]).of_split("train"))
             seconds = max(MIN_SHARE_OF_SHAPE * seconds, seconds - _texture_seconds(config, photos, processors()))
         resolution = choose_resolution(seconds, inputs, progress)
-    return config.model_copy(update={"resolution": resolution, "max_faces": config.max_faces or faces})
+    return config.model_copy(update={"resolution": resolution, "max_faces": config.max_faces or faces, "frame": frame})
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:

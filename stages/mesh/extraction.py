@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from nerf.fields.density_grid import DensityGrid, sample_density_grid
 from nerf.fields.interface import RadianceModel
-from nerf.geometry.scene import Scene
+from nerf.geometry.scene import Scene, Similarity
 from nerf.rendering.volume_rendering import composite
 from stages.contract import Inputs, Progress, StageError, StageResult
 from stages.effects.image_effects import new_view_words
@@ -27,18 +27,20 @@ from stages.mesh.resolution import CHUNK, grid_box, point_cost, points_per_edge,
 from stages.mesh.surface import Surface, decimate, face_areas, is_watertight, keep_faces, vertex_normals
 from stages.mesh.texture.texturing import Textured, texture_of
 from stages.mesh.visibility import ShadowMap, sample_rays, shadow_maps, vertex_visibility
+from stages.scale import metres_per_unit
 
 if TYPE_CHECKING:
     from stages.mesh import Config
 
 ISO_LEVEL_RAYS = 1024
 COLOUR_SAMPLES = 8  # through the two voxels around a vertex
+PRINTED = ("stl", "3mf")  # read in millimetres by the programs that print
 BYTES_PER_POINT = 20  # density, occupancy, its averages and marching cubes; 16 measured at 208³
 
 
 class Source(NamedTuple):
     """What a mesh is made from: the field and its ``info`` (field.json), the scene, sparse ``points`` (n, 3) in the
-    scene frame, the folder of stage ``ingest`` with the masks."""
+    scene frame, the folder of stage ``ingest`` with the masks, metres a unit of the sfm frame where they are known."""
 
     model: RadianceModel
     info: dict[str, Any]
@@ -46,6 +48,18 @@ class Source(NamedTuple):
     points: np.ndarray
     ingest: Path
     device: str
+    metres_per_unit: float | None
+
+    def files_from_scene(self, frame: str | None) -> Similarity:
+        """The similarity from the scene frame to the frame of the files."""
+        if frame == "scene":
+            return Similarity(1.0, np.eye(3), np.zeros(3))
+        sfm = self.scene.scene_from_sfm.inverse()
+        if frame == "sfm":
+            return sfm
+        assert frame == "metric" and self.metres_per_unit, "plan() sets the frame"
+        metres = self.metres_per_unit
+        return Similarity(metres * sfm.scale, sfm.rotation, metres * sfm.translation)
 
 
 class Extracted(NamedTuple):
@@ -66,7 +80,9 @@ def load(inputs: Inputs, progress: Progress) -> Source:
     device = compute_device()
     model, info = load_field(inputs["train"], device, progress)
     points = read_tensors(inputs["normalise"] / "points.safetensors")["xyz"].astype(float)
-    return Source(model, info, read_scene(inputs["normalise"]), points, inputs["ingest"], device)
+    return Source(
+        model, info, read_scene(inputs["normalise"]), points, inputs["ingest"], device, metres_per_unit(inputs["scale"])
+    )
 
 
 def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extracted:
@@ -86,7 +102,7 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     progress.update("cleaning", 0.55)
     min_views = min(config.min_views, len(views))
     cleaned = clean(raw, visibility, source.points, config.keep, min_views, config.min_component)
-    surface = decimate(_cropped(config, cleaned.surface, source.scene), config.max_faces)
+    surface = decimate(_cropped(config, cleaned.surface, source), config.max_faces)
     ends = boundary(surface, box, voxel)
     if config.close:
         surface, closed = close_holes(surface, config.close)
@@ -102,11 +118,11 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     return Extracted(mesh, iso_level, cleaned, closed, ends, voxel, textured)
 
 
-def _cropped(config: "Config", surface: Surface, scene: Scene) -> Surface:
+def _cropped(config: "Config", surface: Surface, source: Source) -> Surface:
     """The faces that lie in the box asked for."""
     if config.box is None:
         return surface
-    vertices = scene.scene_from_sfm.inverse().points(surface.vertices) if config.frame == "sfm" else surface.vertices
+    vertices = source.files_from_scene(config.frame).points(surface.vertices)
     low, high = np.array(config.box).reshape(2, 3)
     within = np.all((vertices >= low) & (vertices <= high), axis=1)
     inside = np.all(within[surface.faces], axis=1)
@@ -194,7 +210,7 @@ def vertex_colours(
 
 def save(config: "Config", extracted: Extracted, source: Source, folder: Path) -> StageResult:
     """Write the files; the summary line and the facts for the report."""
-    outputs = write_mesh(config, extracted.mesh, source.scene, folder)
+    outputs = write_mesh(config, extracted.mesh, source, folder)
     faces, components = len(extracted.mesh.faces), extracted.cleaned.kept
     count = f"{faces / 1000:.0f} k faces" if faces >= 10_000 else f"{faces} faces"
     if (texture := extracted.mesh.texture) is not None:
@@ -206,30 +222,29 @@ def save(config: "Config", extracted: Extracted, source: Source, folder: Path) -
         line += "; the field has no clear surface yet, train for longer"
     appearance = new_view_words(source.info)
     line += "" if appearance is None else f" · {appearance}"
-    facts = _facts(config, extracted, source.scene) | ({} if appearance is None else {"appearance": appearance})
+    facts = _facts(config, extracted, source) | ({} if appearance is None else {"appearance": appearance})
     return StageResult(outputs, line, facts=facts)
 
 
-def write_mesh(config: "Config", mesh: ColouredMesh, scene: Scene, folder: Path) -> tuple[str, ...]:
+def write_mesh(config: "Config", mesh: ColouredMesh, source: Source, folder: Path) -> tuple[str, ...]:
     """Write the files asked for, in the frame asked for, and preview.png; their names."""
-    write_png(folder / "preview.png", preview(mesh, scene))
-    upright = Z_UP_TO_Y_UP
-    if config.frame == "sfm":
-        sfm_from_scene = scene.scene_from_sfm.inverse()
-        vertices, normals = sfm_from_scene.points(mesh.vertices), mesh.normals @ sfm_from_scene.rotation.T
-        mesh = mesh._replace(vertices=vertices, normals=normals)
-        upright = upright @ scene.scene_from_sfm.rotation
+    write_png(folder / "preview.png", preview(mesh, source.scene))
+    files_from_scene = source.files_from_scene(config.frame)
+    vertices, normals = files_from_scene.points(mesh.vertices), mesh.normals @ files_from_scene.rotation.T
+    mesh, upright = mesh._replace(vertices=vertices, normals=normals), Z_UP_TO_Y_UP @ files_from_scene.rotation.T
     names = []
+    in_millimetres = mesh._replace(vertices=1000 * mesh.vertices) if config.frame == "metric" else mesh
     for extension in sorted(set(config.formats)):
-        for name, content in WRITERS[extension](mesh, upright).items():
+        shown = in_millimetres if extension in PRINTED else mesh
+        for name, content in WRITERS[extension](shown, upright).items():
             (folder / name).write_bytes(content)
             names.append(name)
     return (*names, "preview.png")
 
 
-def _facts(config: "Config", extracted: Extracted, scene: Scene) -> dict[str, object]:
+def _facts(config: "Config", extracted: Extracted, source: Source) -> dict[str, object]:
     """Plain values for the report; lengths are in the frame of the files."""
-    unit = 1 / scene.scene_from_sfm.scale if config.frame == "sfm" else 1.0
+    unit = source.files_from_scene(config.frame).scale
     mesh, cleaned, iso_level = extracted.mesh, extracted.cleaned, extracted.iso_level
     return _texture_facts(extracted.textured) | {
         "vertices": len(mesh.vertices),

@@ -117,7 +117,7 @@ def stl_bytes(mesh: ColouredMesh) -> bytes:
 
 
 def threemf_bytes(mesh: ColouredMesh) -> bytes:
-    """3MF (3D Manufacturing Format, core specification 1.3): the shape alone, for printing. A unit of the mesh is
+    """3MF (3D Manufacturing Format, core specification 1.3): the shape alone, for printing. A unit of ``mesh`` is
     written as a millimetre. Not trimesh's, which asks for lxml and names objects at random."""
     vertices = mesh.vertices - offset_for_float32(mesh.vertices)
     model = [

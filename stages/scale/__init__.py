@@ -10,6 +10,7 @@ from pydantic import Field, field_validator
 from tyro.conf import UseAppendAction, arg
 
 from stages.contract import Auto, Inputs, Progress, StageConfig, StageResult, Workload
+from stages.io.files import read_json
 from stages.scale.lengths import parse_length, parse_point
 from stages.scale.marker_names import parse_marker
 
@@ -52,6 +53,11 @@ class Config(StageConfig):
                 raise ValueError(f"both points are {distance[0]}")
             parse_length(distance[2])
         return distance
+
+
+def metres_per_unit(folder: Path) -> float | None:
+    """What the stage's finished ``folder`` says: metres a unit of the sfm frame, None where nothing tells."""
+    return read_json(folder / "scale.json")["metres_per_unit"]
 
 
 def expected_seconds(config: Config, workload: Workload) -> float:

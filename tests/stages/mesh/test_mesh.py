@@ -94,7 +94,7 @@ def run_mesh(tmp_path, progress, monkeypatch):
     for module, name, small in SMALL:
         monkeypatch.setattr(module, name, small)
 
-    def run(model, folder="mesh", scene=None, points=NO_POINTS, learnt=None, **settings):
+    def run(model, folder="mesh", scene=None, points=NO_POINTS, learnt=None, metres=None, **settings):
         inputs = {name: tmp_path / name for name in mesh.INPUTS}
         for path in (*inputs.values(), tmp_path / folder):
             path.mkdir(exist_ok=True)
@@ -102,11 +102,31 @@ def run_mesh(tmp_path, progress, monkeypatch):
         write_tensors(inputs["normalise"] / "points.safetensors", {"xyz": points})
         info = {"rays": 1000, "effects": learnt or {}}
         write_json(inputs["train"] / "field.json", info)
+        write_json(inputs["scale"] / "scale.json", {"metres_per_unit": metres})
         monkeypatch.setattr(extraction, "load_field", lambda *_: (model, info))
         config = mesh.Config.model_validate({"resolution": 48, "texture_size": 0} | settings)
         return run_stage(mesh, config, inputs, tmp_path / folder, progress), tmp_path / folder
 
     return run
+
+
+def test_files_are_in_metres_where_the_scale_is_known(run_mesh, progress):
+    sizes = {}
+    for metres, frame in ((None, None), (2.0, None), (2.0, "sfm")):
+        result, folder = run_mesh(
+            Solid(ball), folder=f"{metres} {frame}", metres=metres, frame=frame, formats=("ply", "glb", "stl")
+        )
+        loaded = {name: trimesh.load(folder / f"mesh.{name}", force="mesh") for name in ("ply", "glb", "stl")}
+        sizes[metres, frame] = [float(max(mesh.extents)) for mesh in loaded.values()]
+        assert result.facts["frame"] == (frame or ("metric" if metres else "sfm"))
+    plain = sizes[None, None]
+    assert plain == pytest.approx([2 * RADIUS / 0.25] * 3, rel=0.1) and sizes[2.0, "sfm"] == plain
+    assert sizes[2.0, None] == pytest.approx([2 * plain[0], 2 * plain[1], 2000 * plain[2]], rel=1e-4)
+
+
+def test_metres_need_a_scale_that_is_known(run_mesh):
+    with refused("mesh.no-metres"):
+        run_mesh(Solid(ball), frame="metric")
 
 
 def test_a_ball_becomes_a_closed_ball_in_the_sfm_frame(run_mesh, progress):
@@ -318,8 +338,9 @@ def test_the_level_asked_for_is_taken(run_mesh):
 )
 def test_the_resolution_follows_the_training(tmp_path, progress, rays, resolution):
     write_json(tmp_path / "field.json", {"rays": rays})
-    assert mesh.plan(mesh.Config(), {"train": tmp_path}, progress).resolution == resolution
-    assert mesh.plan(mesh.Config(resolution=77), {"train": tmp_path}, progress).resolution == 77
+    write_json(tmp_path / "scale.json", {"metres_per_unit": None})
+    assert mesh.plan(mesh.Config(), {"train": tmp_path, "scale": tmp_path}, progress).resolution == resolution
+    assert mesh.plan(mesh.Config(resolution=77), {"train": tmp_path, "scale": tmp_path}, progress).resolution == 77
 
 
 def test_faces_outside_of_the_box_are_left_out(run_mesh):
@@ -360,6 +381,10 @@ def test_colours_that_are_not_finite_are_refused(run_mesh, tmp_path):
 
 def test_faces_follow_whether_there_is_a_texture(tmp_path, progress):
     write_json(tmp_path / "field.json", {"rays": 1000})
+    write_json(tmp_path / "scale.json", {"metres_per_unit": None})
     for size, faces in ((4096, mesh.TEXTURED_FACES), (0, mesh.COLOURED_FACES)):
-        assert mesh.plan(mesh.Config(texture_size=size), {"train": tmp_path}, progress).max_faces == faces
-    assert mesh.plan(mesh.Config(max_faces=500), {"train": tmp_path}, progress).max_faces == 500
+        assert (
+            mesh.plan(mesh.Config(texture_size=size), {"train": tmp_path, "scale": tmp_path}, progress).max_faces
+            == faces
+        )
+    assert mesh.plan(mesh.Config(max_faces=500), {"train": tmp_path, "scale": tmp_path}, progress).max_faces == 500
