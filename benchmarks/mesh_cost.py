@@ -21,24 +21,23 @@ from scipy.spatial import KDTree
 
 from benchmarks.record import Record, add_out
 from nerf import REGION_HALF_SIZE
-from nerf.geometry.scene import Scene
 from pipeline.demo.truth import Truth, compare_with_truth
 from pipeline.engine.display import SilentDisplay
 from pipeline.engine.workspace import Workspace
 from stages.contract import Inputs
 from stages.mesh import COLOURED_FACES, Config
-from stages.mesh.extraction import extract_mesh, load, write_mesh
+from stages.mesh.extraction import Source, extract_mesh, load, write_mesh
 from stages.mesh.files import ColouredMesh
 from stages.mesh.surface import sample_surface
 
 SAMPLES = 200_000  # of the mesh
 
 
-def to_truth(mesh: "ColouredMesh", scene: "Scene", normalise: Path, truth: Truth) -> dict[str, float]:
+def to_truth(mesh: "ColouredMesh", source: Source, normalise: Path, truth: Truth) -> dict[str, float]:
     """Mesh to truth, and truth to mesh, in percent of the scene's size."""
     with tempfile.TemporaryDirectory() as folder:
         shutil.copy(normalise / "transforms.json", folder)
-        write_mesh(Config(formats=("ply",)), mesh, scene, Path(folder))
+        write_mesh(Config(formats=("ply",), frame="sfm"), mesh, source, Path(folder))
         error = compare_with_truth(Path(folder), truth).mesh
     assert error is not None, "the mesh has just been written"
     return {"mesh_to_truth_percent": error.accuracy, "truth_to_mesh_percent": error.completeness}
@@ -63,7 +62,7 @@ def figures(folders: Inputs, resolution: int, truth: Truth | None) -> dict[str, 
     if truth is None:
         known = to_points(made.mesh, source.points)
     else:
-        known = to_truth(made.mesh, source.scene, folders["normalise"], truth)
+        known = to_truth(made.mesh, source, folders["normalise"], truth)
     rounded = {name: round(value, 2) for name, value in known.items()}
     return {"resolution": resolution, "faces": len(made.mesh.faces), "seconds": round(seconds, 1), **rounded}
 

@@ -55,6 +55,9 @@ class VeilModel:
     def forward(self, colour: Tensor, rays: Rays, view: Tensor) -> Tensor:
         return colour + self.level[view]
 
+    def inverse(self, shown: Tensor, rays: Rays, view: Tensor) -> Tensor:
+        return shown - self.level[view]
+
     def backward(self, colour: Tensor, rays: Rays, view: Tensor, grad: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         return grad, {"level": torch.zeros_like(self.level).index_add_(0, view, grad.sum(1, keepdim=True))}
 
