@@ -11,8 +11,8 @@ from pydantic import Field
 
 from stages.contract import READING_SECONDS, Inputs, Progress, StageConfig, StageResult, Workload
 
-INPUTS = ("ingest", "sfm", "normalise", "train")
-VERSION = 1
+INPUTS = ("ingest", "normalise", "scale", "train")
+VERSION = 2
 EXIT_CODE = 21
 RESUMES = False
 PUBLISHED = ("viewer.html",)

@@ -24,6 +24,7 @@ from stages.io.files import read_json, read_scene, read_tensors
 from stages.io.photos import spread
 from stages.render.path import median_camera
 from stages.render.renderer import Renderer, load_renderer
+from stages.scale import metres_per_unit
 from stages.sfm.colmap.cameras import focal_lengths_and_centre, project
 from stages.train.data import PhotoReader, view_rays
 from stages.viewer.tables import FEATURES, Bits, Table, description, quantised, sections, with_table
@@ -159,7 +160,7 @@ def _gains(effects: tuple[ColourEffect, ...]) -> dict[str, list[float]]:
 
 def _scene(scene: Scene, inputs: Inputs) -> dict[str, Any]:
     usual, sfm_from_scene = median_camera(scene), scene.scene_from_sfm.inverse()
-    georeference = read_json(inputs["sfm"] / "registration.json").get("georeference")
+    metres = metres_per_unit(inputs["scale"])
     return {
         "bounded": scene.bounded,
         "has_alpha": scene.has_alpha,
@@ -167,7 +168,7 @@ def _scene(scene: Scene, inputs: Inputs) -> dict[str, Any]:
         "up_known": scene.up_known,
         "forward_facing": scene.capture_type == "forward-facing",
         "sfm_from_scene": sfm_from_scene.matrix().tolist(),
-        "metres_per_unit": georeference and georeference["metres_per_unit"] * sfm_from_scene.scale,
+        "metres_per_unit": metres and metres * sfm_from_scene.scale,
         "lens": _lens(usual),
     }
 

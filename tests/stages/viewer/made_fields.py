@@ -44,10 +44,10 @@ def made(folder: Path, space: str, view_dependence: bool = True, **info: Any) ->
     alpha = space == "box"
     inputs, scene = photographed(folder, channels=4 if alpha else 3, bounded=alpha)
     field = random_field(SPACES[space], not alpha, view_dependence)
-    for name in ("train", "sfm"):
+    for name in ("train", "scale"):
         (folder / name).mkdir()
         inputs[name] = folder / name
-    write_json(inputs["sfm"] / "registration.json", {"georeference": None})
+    write_json(inputs["scale"] / "scale.json", {"metres_per_unit": None})
     background = [1.0, 1.0, 1.0] if alpha else [0.0, 0.0, 0.0]
     save_field(inputs["train"], field, {"background": background, "downscale": 1.0, "effects": {}} | info)
     return Made(inputs, scene, field)

@@ -120,10 +120,10 @@ def test_8_bits_that_lose_too_much_become_16(tmp_path: Path, monkeypatch: pytest
     assert header["field"]["bits"] == 16 and len(parts["table"]) == 8 * field.field.layout.rows
 
 
-def test_lengths_are_in_metres_where_gps_tells_them(tmp_path: Path):
+def test_lengths_are_in_metres_where_the_scale_is_known(tmp_path: Path):
     field = made(tmp_path, "box")
     assert page_of(field, tmp_path / "a")[1]["scene"]["metres_per_unit"] is None
-    (field.inputs["sfm"] / "registration.json").write_text('{"georeference": {"metres_per_unit": 2.5}}', "utf-8")
+    (field.inputs["scale"] / "scale.json").write_text('{"metres_per_unit": 2.5}', "utf-8")
     scale = field.scene.scene_from_sfm.scale
     assert page_of(field, tmp_path / "b")[1]["scene"]["metres_per_unit"] == pytest.approx(2.5 / scale)
 
