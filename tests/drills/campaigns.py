@@ -21,7 +21,7 @@ RELAXED = next(strategy for strategy in STRATEGIES if strategy.matches == "relax
 SFM_INSTANTS = {
     "features": lambda event: event.get("done") is not None,
     "matching": lambda event: event["event"] == "note" and event["message"].startswith("matching "),
-    RELAXED.name: lambda event: event["event"] == "note" and event["message"].endswith(f" yet: {RELAXED.description}"),
+    RELAXED.name: lambda event: event.get("code") == "sfm.strategy" and event["message"].endswith(RELAXED.description),
     "final bundle adjustment": lambda event: event.get("done") == REFINING,
 }
 

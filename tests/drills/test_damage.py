@@ -9,10 +9,11 @@ import pytest
 
 from pipeline.engine import manifests
 from pipeline.engine.manifests import BadManifest
+from pipeline.engine.stage_list import usual
 from tests.drills.campaigns import Chain
 from tests.drills.drill import Program, copy_workspace, finished_folders, results
 
-STAGES = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "report")
+STAGES = usual()
 
 
 def flip(file: Path) -> None:

@@ -16,6 +16,7 @@ from stages import evaluate, mesh, render, train
 from stages.contract import StageConfig, StageError, run_stage
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.io.field_files import load_field
+from stages.io.files import write_json
 from stages.train import Config
 from stages.train.fields.hash_grid_options import HashGridOptions
 from tests.refusals import refused
@@ -148,8 +149,10 @@ LATER: dict[ModuleType, StageConfig] = {
 @pytest.mark.parametrize("stage", LATER, ids=lambda stage: stage.__name__)
 def test_what_torch_trained_stays_with_torch_in_every_stage(stage: ModuleType, tmp_path: Path, progress) -> None:
     inputs, _ = photographed(tmp_path, channels=4)
-    for name in ("train", "later"):
+    for name in ("train", "later", "scale"):
         (tmp_path / name).mkdir()
+    write_json(tmp_path / "scale/scale.json", {"metres_per_unit": None})
+    inputs = inputs | {"scale": tmp_path / "scale"}
     run_stage(train, tiny("torch", steps=2), inputs, tmp_path / "train", progress)
     assert AS_TRAINED not in progress.codes
     with contextlib.suppress(StageError):  # two steps may leave no surface

@@ -64,7 +64,7 @@ def test_just_enough_is_enough(free, there: int, passes: bool):
     with pytest.raises(StageError) as caught:
         check_memory(100 * 2**20, "it", "it takes", "Less.")
     assert caught.value.code == "hardware.not-enough-memory"
-    assert caught.value.why == "it takes 100 MB and 99 MB are free"
+    assert "it takes 100 MB" in caught.value.why and "99 MB" in caught.value.why
 
 
 @pytest.mark.parametrize("there, pieces", [(0, 1), (9, 1), (20, 2), (39, 3), (1000, 8)])
