@@ -110,9 +110,11 @@ def without_contradictions(references: Sequence[Reference], progress: Progress) 
 
 
 def _agree(one: Reference, other: Reference) -> bool:
-    assert one.metres_per_unit and other.metres_per_unit and one.relative_error and other.relative_error
+    assert one.metres_per_unit and other.metres_per_unit, "references that are usable have a length"
     apart = abs(math.log(one.metres_per_unit / other.metres_per_unit))
-    return apart <= max(READING_ERROR, MAX_STANDARD_ERRORS * math.hypot(one.relative_error, other.relative_error))
+    return apart <= max(
+        READING_ERROR, MAX_STANDARD_ERRORS * math.hypot(one.relative_error or 0.0, other.relative_error or 0.0)
+    )
 
 
 # --- markers

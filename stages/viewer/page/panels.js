@@ -31,7 +31,7 @@ class Panels {
       byId("menu").setAttribute("aria-expanded", String(open));
     };
     this.on("menu", "click", () => toggle(panel.hidden));
-    toggle(window.innerWidth > 640);
+    toggle(window.innerWidth > 900); // on a smaller one it would hide the scene
   }
 
   shown() {
