@@ -6,7 +6,6 @@ across it pass half of the light on both sides, and corners are where the lines 
 on ray directions, in which the sides are straight whatever the lens.
 """
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import cv2
@@ -15,7 +14,6 @@ from jaxtyping import Float, UInt8
 
 from nerf.geometry.scene import Camera
 from nerf.rendering.srgb import linear_light
-from stages.scale.marker_names import Marker
 from stages.sfm.colmap.cameras import ray_directions
 
 PROFILES = 24  # across each side
@@ -38,14 +36,11 @@ def find_markers(photo: UInt8[np.ndarray, "h w c"], dictionary: str, mirrored: b
     """Every marker of a dictionary in a photo, to about a pixel; of ``mirrored``, the mirror images of markers."""
     grey = cv2.cvtColor(np.ascontiguousarray(photo[..., :3]), cv2.COLOR_RGB2GRAY)
     grey = cv2.flip(grey, 1) if mirrored else grey
-    predefined = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
-    corners, numbers, _ = cv2.aruco.ArucoDetector(predefined).detectMarkers(grey)
+    corners, numbers, _ = cv2.aruco.ArucoDetector(_predefined(dictionary)).detectMarkers(grey)
+    if numbers is None:
+        return []
     # OpenCV has the centre of the first pixel at 0.
-    return (
-        []
-        if numbers is None
-        else [Found(int(n), c.reshape(4, 2) + 0.5) for n, c in zip(np.ravel(numbers), corners, strict=True)]
-    )
+    return [Found(int(n), c.reshape(4, 2) + 0.5) for n, c in zip(np.ravel(numbers), corners, strict=True)]
 
 
 def luminance(photo: UInt8[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w"]:
@@ -122,12 +117,8 @@ def _fitted_line(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "3"]:
 
 def cells_of(dictionary: str) -> int:
     """Cells along a side of a dictionary's markers, black border included."""
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}")).markerSize + 2
+    return _predefined(dictionary).markerSize + 2
 
 
-def by_dictionary(markers: Iterable[Marker]) -> dict[str, set[int]]:
-    """The numbers wanted of each dictionary."""
-    wanted: dict[str, set[int]] = {}
-    for marker in markers:
-        wanted.setdefault(marker.dictionary, set()).add(marker.number)
-    return wanted
+def _predefined(dictionary: str) -> cv2.aruco.Dictionary:
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))

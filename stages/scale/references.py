@@ -13,7 +13,7 @@ from nerf.geometry.scene import Scene, View
 from stages.contract import Inputs, Note, Progress, StageResult, listed
 from stages.io.files import read_json, read_scene, write_json
 from stages.io.pixels import load_pixels, loaders
-from stages.scale.detection import by_dictionary, cells_of, find_markers, locate_corners, luminance
+from stages.scale.detection import cells_of, find_markers, locate_corners, luminance
 from stages.scale.lengths import length_in_words, parse_length, parse_point
 from stages.scale.marker_names import Marker, parse_marker
 from stages.scale.square_fit import Sightings, Square, fit_square
@@ -62,17 +62,9 @@ def measure_scale(config: "Config", inputs: Inputs, folder: Path, progress: Prog
         _compare_with_gps(gps, combined(used)[0], progress)
     used = used or ([gps] if gps else [])
     metres, error = combined(used) if used else (None, None)
-    source = used[0].kind if used else None
-    write_json(
-        folder / "scale.json",
-        {
-            "metres_per_unit": metres,
-            "relative_error": error,
-            "source": source,
-            "references": [asdict(reference) for reference in (*references, *([gps] if gps else []))],
-        },
-    )
-    facts = {"metres_per_unit": metres, "relative_error": error, "source": source}
+    facts = {"metres_per_unit": metres, "relative_error": error, "source": used[0].kind if used else None}
+    known = [*references, gps] if gps else references
+    write_json(folder / "scale.json", facts | {"references": [asdict(reference) for reference in known]})
     return StageResult(("scale.json",), _line(used, metres, error, asked=bool(references)), facts=facts)
 
 
@@ -146,7 +138,7 @@ class _Sighting(NamedTuple):
 def _search(markers: Sequence[Marker], scene: Scene, ingest: Path, progress: Progress) -> dict[Marker, list[_Sighting]]:
     """Where each marker is seen, by views."""
     wanted = {(marker.dictionary, marker.number): marker for marker in markers}
-    cells = {dictionary: cells_of(dictionary) for dictionary in by_dictionary(markers)}
+    cells = {marker.dictionary: cells_of(marker.dictionary) for marker in markers}
 
     def search(index: int) -> list[tuple[Marker, _Sighting]]:
         view = scene.views[index]
@@ -181,9 +173,9 @@ def _mirrored(missing: Sequence[Marker], scene: Scene, ingest: Path) -> set[Mark
     found = set()
     for view in scene.views if missing else ():
         photo = _photo(view, scene, ingest)
-        for dictionary, numbers in by_dictionary(missing).items():
-            here = {each.number for each in find_markers(photo, dictionary, mirrored=True)} & numbers
-            found |= {marker for marker in missing if marker.dictionary == dictionary and marker.number in here}
+        for dictionary in {marker.dictionary for marker in missing}:
+            here = {(dictionary, each.number) for each in find_markers(photo, dictionary, mirrored=True)}
+            found |= {marker for marker in missing if (marker.dictionary, marker.number) in here}
     return found
 
 
@@ -278,7 +270,12 @@ def _compare_with_gps(gps: Reference, metres: float, progress: Progress) -> None
 
 def _with_error(reference: Reference) -> str:
     assert reference.metres_per_unit
-    return f"{length_in_words(reference.metres_per_unit)} ± {100 * 2 * (reference.relative_error or 0):.2g} %"
+    return _in_words(reference.metres_per_unit, reference.relative_error or 0)
+
+
+def _in_words(metres: float, relative_error: float) -> str:
+    """A unit's length with two standard errors."""
+    return f"{length_in_words(metres)} ± {100 * 2 * relative_error:.2g} %"
 
 
 def _line(used: Sequence[Reference], metres: float | None, error: float | None, asked: bool) -> str:
@@ -287,4 +284,4 @@ def _line(used: Sequence[Reference], metres: float | None, error: float | None, 
     markers = sum(reference.kind == "marker" for reference in used)
     kinds = {"marker": f"{markers} marker{'s' * (markers > 1)}", "distance": "the distance given", "gps": "GPS"}
     sources = " and ".join(dict.fromkeys(kinds[reference.kind] for reference in used))
-    return f"1 unit = {length_in_words(metres)} ± {100 * 2 * error:.2g} % by {sources}"
+    return f"1 unit = {_in_words(metres, error)} by {sources}"
