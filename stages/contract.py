@@ -123,7 +123,8 @@ def listed(names: Sequence[str], most: int) -> str:
 
 
 class Note(NamedTuple):
-    """A line that stays: a decision and its reason, or a warning; ``code`` is its name for programs, as of errors."""
+    """A line that stays: a decision and its reason, a warning, or why a photo is missing; ``code`` is its name for
+    programs, as of errors."""
 
     code: str
     text: str

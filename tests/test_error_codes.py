@@ -9,15 +9,14 @@ import pytest
 from stages.contract import StageError
 from tests.refusals import refused
 from tests.test_architecture import OURS, ROOT, Module, module, offenders
-from tests.wording import SNAPSHOT, code_of, made, package_of, snapshots
+from tests.wording import SNAPSHOT, codes_of, made, package_of, snapshots
 
 CODE = re.compile(r"[a-z]+(\.[a-z]+(-[a-z]+)*)")
 
 
 def wrong_codes(module: Module) -> Iterator[str]:
     package = package_of(module).split("/")[-1]
-    for call in made(module.tree):
-        code = code_of(call, module)
+    for code in (code for call in made(module.tree) for code in codes_of(call, module)):
         if not CODE.fullmatch(code) or code.split(".")[0] != package:
             yield f"{code} is not {package}.some-words"
 
@@ -27,7 +26,7 @@ def test_codes_name_the_package_they_come_from() -> None:
 
 
 def test_a_code_is_used_once() -> None:
-    used = Counter(code_of(call, module) for module in OURS for call in made(module.tree))
+    used = Counter(code for module in OURS for call in made(module.tree) for code in codes_of(call, module))
     assert len(used) > 220
     assert [code for code, times in used.items() if times > 1] == []
 

@@ -7,6 +7,7 @@ one of several sentences is chosen, each has a line.
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 from tests.test_architecture import OURS, ROOT, Module
@@ -16,7 +17,7 @@ SNAPSHOT = "messages.txt"
 
 def makers(modules: list[Module]) -> dict[str, ast.FunctionDef | None]:
     """What makes an error or a note, and the functions that are given its code, with how they are defined."""
-    found: dict[str, ast.FunctionDef | None] = {"StageError": None, "Note": None}
+    found: dict[str, ast.FunctionDef | None] = {"StageError": None, "Note": None, "DecodeError": None}
     for node in (node for module in modules for node in ast.walk(module.tree)):
         if isinstance(node, ast.FunctionDef) and node.args.args and node.args.args[0].arg == "code":
             found[node.name] = node
@@ -33,20 +34,25 @@ def package_of(module: Module) -> str:
 
 
 def made(tree: ast.AST) -> Iterator[ast.Call]:
-    """Calls that make an error or a note with a code of its own."""
+    """Calls that make an error, a note, or a reason why a file is no photo."""
     for node in ast.walk(tree):
         if not (isinstance(node, ast.Call) and node.args and not isinstance(node.args[0], ast.Starred)):
             continue
         makes = isinstance(node.func, ast.Name) and node.func.id in MAKERS
         notes = (isinstance(node.func, ast.Attribute) and node.func.attr == "note") or ast.unparse(node.func) == "note"
-        if (makes or notes) and ast.unparse(node.args[0]) not in ("code", "error.code"):
+        if (makes or notes) and ast.unparse(node.args[0]) != "error.code":
             yield node
 
 
+@cache
 def assigned(tree: ast.AST, own: bool = False) -> dict[str, list[ast.expr]]:
     """What stands behind a name: every expression that it is given in ``tree``, or at its top alone (``own``)."""
     found: dict[str, list[ast.expr]] = {}
     for node in ast.iter_child_nodes(tree) if own else ast.walk(tree):
+        if isinstance(node, ast.For) and isinstance(node.target, ast.Tuple) and isinstance(node.iter, ast.Tuple):
+            for row in node.iter.elts:
+                for name, value in zip(node.target.elts, row.elts if isinstance(row, ast.Tuple) else [], strict=False):
+                    found.setdefault(ast.unparse(name), []).append(value)
         if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign) and node.value is not None:
             for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
                 names = target.elts if isinstance(target, ast.Tuple) else [target]
@@ -76,23 +82,39 @@ def sentences(expression: ast.expr, names: dict[str, list[ast.expr]], depth: int
     return ["{" + ast.unparse(expression) + "}"]
 
 
-def code_of(call: ast.Call, module: Module) -> str:
-    (code,) = sentences(call.args[0], assigned(module.tree, own=True))
-    return code
+@cache
+def functions_around(tree: ast.AST) -> dict[ast.AST, list[ast.FunctionDef]]:
+    """The functions in which each node of ``tree`` stands, outermost first."""
+    around: dict[ast.AST, list[ast.FunctionDef]] = {}
+    for scope in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+        for node in ast.walk(scope):
+            around.setdefault(node, []).append(scope)
+    return around
+
+
+def codes_of(call: ast.Call, module: Module) -> list[str]:
+    """The codes that a call may give: several where a name stands for one of them, none where a caller gives it."""
+    scopes = functions_around(module.tree).get(call, [])
+    given = {argument.arg for scope in scopes for argument in scope.args.args}
+    names = assigned(module.tree, own=True) | {k: v for scope in scopes for k, v in assigned(scope).items()}
+    code = call.args[0]
+    if isinstance(code, ast.Subscript) or (isinstance(code, ast.Name) and code.id in given):
+        return []
+    return sentences(code, names)
 
 
 def wording(module: Module) -> Iterator[tuple[str, list[str]]]:
     """Each code of a module with how it is worded."""
     constants = assigned(module.tree, own=True)
-    scopes = [node for node in ast.walk(module.tree) if isinstance(node, ast.FunctionDef)]
 
     def texts(call: ast.Call, parts: list[ast.expr]) -> list[str]:
-        inside = [scope for scope in scopes if call in ast.walk(scope)]
-        names = constants | {name: values for scope in inside for name, values in assigned(scope).items()}
+        scopes = functions_around(module.tree).get(call, [])
+        names = constants | {name: values for scope in scopes for name, values in assigned(scope).items()}
         return list(dict.fromkeys(text for part in parts for text in sentences(part, names)))
 
     for call in made(module.tree):
-        yield code_of(call, module), texts(call, call.args[1:])
+        for code in codes_of(call, module):
+            yield code, texts(call, call.args[1:])
 
 
 def snapshots() -> dict[str, str]:

@@ -217,11 +217,11 @@ def _take(file: Path, name: str, mask: Path | None, stored: bool, waiting: Path)
     """Decode one file and leave its pixels in ``waiting``. Raises OSError only where writing fails."""
     try:
         decoded = decode(file)
+        if decoded.panorama:
+            raise DecodeError("ingest.panorama", f"a panorama: {cutting_advice('PHOTO', '0.jpg')}")
         taken_mask = mask and _take_mask(mask, decoded.camera_key, stored, waiting.with_suffix(".mask"))
     except DecodeError as error:
-        return Rejection(name, str(error))
-    if decoded.panorama:
-        return Rejection(name, f"a panorama: {cutting_advice('PHOTO', '0.jpg')}")
+        return Rejection(name, error.code, error.reason)
     pixels = decoded.pixels
     lossy = decoded.lossy and pixels.shape[2] == 3
     if decoded.suffix:
@@ -283,7 +283,7 @@ def _without_duplicates(taken: Sequence[_Taken]) -> tuple[list[_Taken], list[Rej
         first.setdefault(photo.digest, photo)
     kept = [photo for photo in taken if first[photo.digest] is photo]
     repeated = [photo for photo in taken if first[photo.digest] is not photo]
-    return kept, [Rejection(photo.name, f"identical to {shown(first[photo.digest].name)}") for photo in repeated]
+    return kept, [Rejection(photo.name, *messages.identical(first[photo.digest].name)) for photo in repeated]
 
 
 def _checked(

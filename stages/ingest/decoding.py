@@ -36,7 +36,15 @@ _LOSSY = ("JPEG", "MPO", "HEIF", "AVIF")
 
 
 class DecodeError(Exception):
-    """A file that cannot become a photo; the text is the reason, to be shown after its name."""
+    """A file that cannot become a photo: ``code`` for programs, and the reason, to be shown after the file's name."""
+
+    def __init__(self, code: str, reason: str) -> None:
+        super().__init__(code, reason)
+        self.code = code
+        self.reason = reason
+
+    def __str__(self) -> str:
+        return self.reason
 
 
 class CameraKey(NamedTuple):
@@ -91,25 +99,27 @@ def decode(path: Path) -> Decoded:
 def _open(path: Path) -> Image.Image:
     """The image with its header read, of a size we accept."""
     if path.suffix.lower() in RAW_EXTENSIONS:
-        raise DecodeError("camera raw files are not supported; export JPEG, PNG or TIFF")
+        raise DecodeError("ingest.raw-file", "camera raw files are not supported; export JPEG, PNG or TIFF")
     library = pillow()
     try:
         image = library.open(path, formats=_FORMATS)
     except library.UnidentifiedImageError as error:
-        raise DecodeError(_unrecognised(path)) from error
+        raise _unrecognised(path) from error
     except FileNotFoundError as error:
         gone = "a broken link" if path.is_symlink() else "there is no such file"
-        raise DecodeError(gone) from error
+        raise DecodeError("ingest.missing-file", gone) from error
     except Exception as error:  # on damaged files Pillow's parsers raise whatever they run into
         if isinstance(error, OSError) and error.errno is not None:  # not Pillow's but the system's
-            raise DecodeError(f"cannot be read: {error.strerror}") from error
-        raise DecodeError(f"damaged: its header cannot be read ({error})") from error
+            raise DecodeError("ingest.unreadable-file", f"cannot be read: {error.strerror}") from error
+        raise _damaged(f"damaged: its header cannot be read ({error})") from error
     width, height = image.size
     if width * height > MAX_PIXELS:
         megapixels = width * height / 1e6
-        raise DecodeError(f"{width}×{height} is {megapixels:.0f} megapixels; the limit is {MAX_PIXELS / 1e6:.0f}")
+        large = f"{width}×{height} is {megapixels:.0f} megapixels; the limit is {MAX_PIXELS / 1e6:.0f}"
+        raise DecodeError("ingest.too-large", large)
     if min(width, height) < MIN_SIDE_PX:
-        raise DecodeError(f"{width}×{height} is too small; each side needs at least {MIN_SIDE_PX} pixels")
+        small = f"{width}×{height} is too small; each side needs at least {MIN_SIDE_PX} pixels"
+        raise DecodeError("ingest.too-small", small)
     return image
 
 
@@ -137,23 +147,27 @@ def _load(image: Image.Image) -> None:
     try:
         image.load()
     except MemoryError as error:
-        raise DecodeError("does not fit into memory") from error
+        raise DecodeError("ingest.file-exceeds-memory", "does not fit into memory") from error
     except OSError as error:
-        raise DecodeError(_what_is_missing(image, error)) from error
+        raise _damaged(_what_is_missing(image, error)) from error
     except Exception as error:  # as in _open
-        raise DecodeError(f"damaged: {error}") from error
+        raise _damaged(f"damaged: {error}") from error
 
 
-def _unrecognised(path: Path) -> str:
+def _unrecognised(path: Path) -> DecodeError:
     with path.open("rb") as file:
         head = file.read(256)
     if not head:
-        return "the file is empty"
+        return DecodeError("ingest.empty-file", "the file is empty")
     if head.startswith((b"\xff\xd8", b"\x89PNG")):
-        return "damaged: its header cannot be read"
-    if all(byte in b"\t\r\n" or 32 <= byte < 127 for byte in head):
-        return "not an image: it is text"
-    return "not an image of a known format"
+        return _damaged("damaged: its header cannot be read")
+    is_text = all(byte in b"\t\r\n" or 32 <= byte < 127 for byte in head)
+    why = "not an image: it is text" if is_text else "not an image of a known format"
+    return DecodeError("ingest.not-an-image", why)
+
+
+def _damaged(how: str) -> DecodeError:
+    return DecodeError("ingest.damaged-file", how)
 
 
 def _convert(image: Image.Image, stored_plainly: bool, lossy: bool, turned: int | None) -> Decoded:
@@ -240,17 +254,20 @@ def _to_eight_bit(image: Image.Image) -> Image.Image:
     try:
         return image.convert("L" if image.mode == "1" else "RGB")
     except ValueError as error:
-        raise DecodeError(f"its pixel format {image.mode} is not supported; export JPEG, PNG or TIFF") from error
+        why = f"its pixel format {image.mode} is not supported; export JPEG, PNG or TIFF"
+        raise DecodeError("ingest.pixel-format", why) from error
 
 
 def _quantised(image: Image.Image) -> Image.Image:
     """Grey of 16 bits, or of floats in [0, 1], as 8 bits."""
     values = np.asarray(image)
     if wrong := int(values.size - np.isfinite(values).sum()):
-        raise DecodeError(f"{wrong:,} of its {values.size:,} pixels are NaN or infinite")
+        why = f"{wrong:,} of its {values.size:,} pixels are NaN or infinite"
+        raise DecodeError("ingest.not-finite", why)
     limit = 1.0 if image.mode == "F" else 65535.0
     if not (values.min() >= 0 and values.max() <= limit):
-        raise DecodeError(f"its pixel values run from {values.min()} to {values.max()}; export it with 8 or 16 bits")
+        span = f"its pixel values run from {values.min()} to {values.max()}; export it with 8 or 16 bits"
+        raise DecodeError("ingest.pixel-range", span)
     return pillow().fromarray(np.rint(values * (255 / limit)).astype(np.uint8))
 
 

@@ -40,10 +40,10 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     extension says that they are no images. Folders that are symbolic links are not followed.
     Raises StageError if nothing remains and PermissionError for a folder that cannot be read.
     """
-    found = files_below(root, _is_photo_folder)
+    found = files_below(root, is_photo_folder)
     if not found:
         raise StageError("ingest.empty-folder", f"{root} is empty", "it holds no file", FOLDER_HINT)
-    photos, videos = [file for file in found if _may_be_photo(file)], _videos(found)
+    photos, videos = [file for file in found if may_be_photo(file)], _videos(found)
     unknown = not any(file.suffix.lower() in IMAGES + RAW_EXTENSIONS for file in photos)
     if len(videos) == 1 and unknown and len(photos) <= MAX_OTHER_FILES:
         photos = []  # a README, say; more of them may be photos of whatever ending
@@ -60,16 +60,9 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     return tuple(photos or videos)
 
 
-def photo_root(folder: Path) -> Path:
-    """The folder of the photos of a folder that was given: its ``images`` if that holds any, else itself."""
-    images = folder / "images"
-    holds_photos = images.is_dir() and any(map(_may_be_photo, walk_photos(images)))
-    return images if holds_photos else folder
-
-
 def walk_photos(root: Path) -> Iterator[Path]:
     """The files below ``root``, photos or not, in any order, but for hidden ones, masks and workspaces of ours."""
-    return _walk(root, _is_photo_folder)
+    return _walk(root, is_photo_folder)
 
 
 def files_below(root: Path, enters: Callable[[Path], bool]) -> list[Path]:
@@ -93,11 +86,13 @@ def _is_lost(file: Path) -> bool:
     return file.suffix.lower() in IMAGES + _VIDEOS and file.is_symlink() and not file.exists()
 
 
-def _is_photo_folder(folder: Path) -> bool:
+def is_photo_folder(folder: Path) -> bool:
+    """Whether photos are looked for in a folder: it is not hidden, holds no masks, and is no workspace of ours."""
     return not folder.name.startswith(".") and folder.name.lower() != MASKS and not (folder / "run.json").is_file()
 
 
-def _may_be_photo(file: Path) -> bool:
+def may_be_photo(file: Path) -> bool:
+    """Whether a file may be a photo by its ending."""
     return file.suffix.lower() not in _NOT_PHOTOS and not is_video(file)
 
 

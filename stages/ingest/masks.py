@@ -64,7 +64,7 @@ def read_mask(file: Path, width: int, height: int, orientation: int, stored: boo
     try:
         decoded = decode(file)
     except DecodeError as error:
-        raise DecodeError(f"its mask {file.name} cannot be used: {error}") from error
+        raise DecodeError("ingest.mask-unusable", f"its mask {file.name} cannot be used: {error}") from error
     light, grey = _light(decoded, file)
     if marks_ignored(file.name):  # all that is not black, as instant-ngp has it
         light = np.where(light > 0, np.uint8(0), np.uint8(255))
@@ -73,7 +73,7 @@ def read_mask(file: Path, width: int, height: int, orientation: int, stored: boo
     fits, fits_stored = _same_shape(found, size), _same_shape(found, _stored(size, orientation))
     if not (fits or fits_stored):
         shapes = f"{found[0]}×{found[1]} and the photo is {width}×{height}"
-        raise DecodeError(f"its mask {file.name} does not fit: it is {shapes}")
+        raise DecodeError("ingest.mask-shape", f"its mask {file.name} does not fit: it is {shapes}")
     ambiguous = fits and fits_stored and orientation != 1 and decoded.camera_key.orientation == 1
     turned = stored if ambiguous else not fits
     if turned:
@@ -84,7 +84,8 @@ def read_mask(file: Path, width: int, height: int, orientation: int, stored: boo
     if not pixels.any():
         alpha = ", where it is not transparent" if decoded.pixels.shape[2] == 4 else ""
         raise DecodeError(
-            f"its mask {file.name} ignores the whole photo (its brightest value is {light.max()} of 255{alpha})"
+            "ingest.mask-empty",
+            f"its mask {file.name} ignores the whole photo (its brightest value is {light.max()} of 255{alpha})",
         )
     return Mask(pixels, turned, resized, ambiguous, grey)
 

@@ -3,6 +3,7 @@
 import os
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 from stages.contract import Note, Progress, StageError, listed
@@ -10,11 +11,19 @@ from stages.ingest.auxiliary_files import ALL_PHOTOS, instant_ngp_masks, is_mask
 from stages.ingest.masks import STILL_BACKGROUND_HINT
 from stages.ingest.near_duplicates import Brackets
 from stages.ingest.sharpness import BLURRED
-from stages.ingest.sources import Source, mask_beside, photos_beside, unused_cameras, unused_masks
+from stages.ingest.sources import (
+    Source,
+    mask_beside,
+    photos_beside,
+    reduced_folders,
+    unused_cameras,
+    unused_masks,
+)
 from stages.io.photos import Photo, Rejection
 
 MAX_NOTES = 10
-OF_MASK = "its mask "  # how rejections for a mask begin
+OF_MASK = "ingest.mask-"  # how the codes of rejections for a mask begin
+IDENTICAL = "ingest.identical"  # the code of a file with the pixels of another one
 MANY_IGNORED = 0.6  # of the pixels: masks that are meant the other way round ignore so many
 NEARLY_BLACK = 16  # of 255: the most that 12 bits make in a file of 16
 HINT = "Take 20 to 100 overlapping photos of one scene from different places and put them into one folder."
@@ -23,6 +32,11 @@ HINT = "Take 20 to 100 overlapping photos of one scene from different places and
 def shown(name: str) -> str:
     """A name as it may be printed: nothing in it can steer a terminal."""
     return name if name.isprintable() else repr(name)
+
+
+def identical(name: str) -> Note:
+    """Why a file is rejected that has the pixels of photo ``name``."""
+    return Note(IDENTICAL, f"identical to {shown(name)}")
 
 
 def note_first(notes: Sequence[Note], where: str, progress: Progress) -> None:
@@ -60,6 +74,10 @@ def note_unused(source: Source, photos: Path, progress: Progress) -> None:
         lie, them = ("1 photo", "is") if beside == 1 else (f"{beside} photos", "are")
         how = f"to use all, move them into images/; to use only them, move images/ out of {folder}"
         progress.note("ingest.photos-beside-images", f"{lie} in {folder} beside images/ {them} not used: {how}")
+    if source.root != photos.absolute() and (copies := reduced_folders(photos, but=source.root)):
+        which = listed([f"{folder.name}/" for folder in copies], 3)
+        what = f"the photos of {source.root.name}/ are used, and not their smaller copies in {which}"
+        progress.note("ingest.smaller-copies", f"{what}; to use those, give the folder itself")
     if others := source.other_endings:
         which = listed([f"{shown(photo)} ({shown(path)})" for path, photo in others.items()], 3)
         words = f"{len(others)} frames use photos of the same name with another file ending: {which}"
@@ -207,7 +225,7 @@ def too_few(source: Source, names: Sequence[str], rejected: Sequence[Rejection])
     """The error for one photo or none, ``names``, and what the rejections show."""
     if not names:
         first = f"{shown(rejected[0].name)}: {rejected[0].reason}"
-        of_masks = all(one.reason.startswith(OF_MASK) for one in rejected)
+        of_masks = all(one.code.startswith(OF_MASK) for one in rejected)
         return StageError(
             "ingest.no-usable-photo",
             f"none of the {len(rejected)} files in {source.root} is a usable photo",
@@ -215,7 +233,7 @@ def too_few(source: Source, names: Sequence[str], rejected: Sequence[Rejection])
             "Correct the masks (black is ignored, white is used), or remove them." if of_masks else HINT,
         )
     only = shown(names[0])
-    if rejected and all(rejection.reason.startswith("identical to ") for rejection in rejected):
+    if rejected and all(rejection.code == IDENTICAL for rejection in rejected):
         return StageError(
             "ingest.identical-photos",
             f"all {len(rejected) + 1} photos are identical",
@@ -283,7 +301,7 @@ def facts(source: Source, photos: Sequence[Photo], rejected: Sequence[Rejection]
     return {
         "source": source.kind,
         "photos": len(photos),
-        "rejected": [{"name": rejection.name, "reason": rejection.reason} for rejection in rejected],
+        "rejected": [asdict(rejection) for rejection in rejected],
         "sizes": sorted([width, height] for width, height in {(photo.width, photo.height) for photo in photos}),
         "cameras": len({photo.camera_group for photo in photos}),
         "focal_known": sum(photo.focal_px is not None for photo in photos),

@@ -20,9 +20,10 @@ from stages.ingest.listing import (
     IMAGES,
     MASKS,
     files_below,
+    is_photo_folder,
     is_video,
     list_photos,
-    photo_root,
+    may_be_photo,
     walk_photos,
 )
 from stages.io.transforms_files import HELD_OUT, TRAIN, photo_names, read_splits
@@ -48,6 +49,7 @@ OTHER_CAMERAS = {
     ".abc": ("an Alembic file", ""),
     ".npz": ("a NumPy archive", ""),
 }
+_REDUCED = re.compile(r"images_(\d+)")
 _OF_MASKS = re.compile(r"masks?([._-].*)?", re.IGNORECASE)
 _HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
 
@@ -134,12 +136,42 @@ def _source(photos: Path, cameras: Path | None) -> Source:
     return Source("photos", root, None, files, excluded=excluded)
 
 
+def photo_root(folder: Path) -> Path:
+    """The folder of the photos of a folder that was given: its ``images`` if that holds any, else the largest of
+    ``images_2``, ``images_4``, … where these hold copies of the same photos and nothing else does, else itself."""
+    images = folder / "images"
+    if images.is_dir() and any(map(may_be_photo, walk_photos(images))):
+        return images
+    reduced = reduced_folders(folder)
+    if not reduced or any(
+        map(may_be_photo, files_below(folder, lambda one: is_photo_folder(one) and one not in reduced))
+    ):
+        return folder
+    return reduced[0] if all(_is_reduction(smaller, reduced[0]) for smaller in reduced[1:]) else folder
+
+
+def reduced_folders(folder: Path, but: Path | None = None) -> list[Path]:
+    """The folders of photos that are called as reductions are, ``images_2``, ``images_4``, …, the largest first."""
+    named = [(int(number[1]), one) for one in folder.glob("*/") if (number := _REDUCED.fullmatch(one.name))]
+    return [one for _, one in sorted(named) if one != but and any(map(may_be_photo, walk_photos(one)))]
+
+
+def _is_reduction(smaller: Path, larger: Path) -> bool:
+    """Whether all photos of a folder are called like some of another one, and the first of them has fewer pixels."""
+    from stages.ingest.decoding import pixel_count  # OpenCV
+
+    ours, theirs = ({file.stem: file for file in files_below(at, is_photo_folder)} for at in (smaller, larger))
+    first = min(ours)
+    return ours.keys() <= theirs.keys() and 0 < pixel_count(ours[first]) < pixel_count(theirs[first])
+
+
 def unused_cameras(source: Source) -> Path | None:
     """What lies with photos that were given without cameras and could be given as their cameras: the one COLMAP model
     in a ``sparse`` folder, a transforms.json that names some of them, or LLFF's file."""
     if source.kind != "photos":
         return None
-    places = (source.root.parent, source.root) if source.root.name == "images" else (source.root,)
+    inside = source.root.name == "images" or _REDUCED.fullmatch(source.root.name)
+    places = (source.root.parent, source.root) if inside else (source.root,)
     for place, name in product(places, ("sparse", "colmap", "dense")):
         with suppress(StageError, OSError):
             return _colmap_model(place / name, [source.name(file) for file in source.files])

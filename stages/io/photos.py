@@ -62,9 +62,10 @@ class Photo:
 
 @dataclass(frozen=True)
 class Rejection:
-    """A file that was not taken, and why."""
+    """A file that was not taken, and why: ``code`` for programs, ``reason`` for people."""
 
     name: str
+    code: str
     reason: str
 
 

@@ -36,7 +36,7 @@ class CheckedModel(NamedTuple):
     have kept their images since."""
 
     model: Any
-    excluded: dict[str, str]
+    excluded: dict[str, Note]
     sequence_broken: bool
     fits: bool
     checks: Sequence[Candidate] = ()

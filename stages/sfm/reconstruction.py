@@ -10,7 +10,7 @@ import numpy as np
 
 from nerf.geometry.georeference import georeference
 from nerf.geometry.scene import Camera
-from stages.contract import Progress, StageError, listed
+from stages.contract import Note, Progress, StageError, listed
 from stages.hardware.memory import check_memory
 from stages.io.photos import Photo, read_photos
 from stages.sfm.colmap.cameras import is_valid
@@ -32,7 +32,7 @@ from stages.sfm.registration import (
     why_no_model,
     with_near_duplicates,
 )
-from stages.sfm.retry_strategies import LOG, read_kept, skipped_for_time
+from stages.sfm.retry_strategies import LOG, read_kept, read_notes, skipped_for_time
 from stages.sfm.worker_process import run_worker
 
 MAX_NAMES = 5
@@ -101,7 +101,8 @@ def _reconstruct(
         # By the matches of the first strategy: later ones let in many that are false.
         raise why_no_model(photos, read_matches(database), len(models[0]) if models else 0, points)
     matches, conflict = read_matches(Path(found["database"])), found["conflict"]
-    images = image_rows(names, matches, models, found["observations"], found["supports"], conflict, found["left_out"])
+    left_out = read_notes(found["left_out"])
+    images = image_rows(names, matches, models, found["observations"], found["supports"], conflict, left_out)
     if conflict:
         progress.note(
             "sfm.repeated-structure", repeated_structure(conflict, {photo.image_name: photo.name for photo in photos})
@@ -245,15 +246,19 @@ def _georeference(folder: Path, photos: Sequence[Photo], progress: Progress) -> 
 
 
 def _note_unregistered(photos: Sequence[Photo], images: list[dict[str, Any]], progress: Progress) -> None:
-    missing = [(photo.name, i["reason"]) for photo, i in zip(photos, images, strict=True) if not i["registered"]]
+    missing = [
+        (photo.name, Note(i["reason_code"], i["reason"]))
+        for photo, i in zip(photos, images, strict=True)
+        if not i["registered"]
+    ]
     if not missing:
         return
     progress.note("sfm.unregistered", f"{len(missing)} of {len(photos)} photos are unregistered and left out:")
-    by_reason: dict[str, list[str]] = {}
+    by_reason: dict[Note, list[str]] = {}
     for name, reason in missing:
         by_reason.setdefault(reason, []).append(name)
     for reason, who in by_reason.items():
-        progress.note("sfm.unregistered-reason", f"  {listed(who, MAX_NAMES)}: {reason}")
+        progress.note(*reason._replace(text=f"  {listed(who, MAX_NAMES)}: {reason.text}"))
 
 
 def _note_weak_links(photos: Sequence[Photo], links: Sequence[dict[str, Any]], progress: Progress) -> None:

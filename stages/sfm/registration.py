@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from stages.contract import StageError, listed
+from stages.contract import Note, StageError, listed
 from stages.ingest.masks import STILL_BACKGROUND_HINT
 from stages.io.photos import Photo
 from stages.sfm.degeneracy import count_pure_rotations, epipoles_inside, flow_is_radial
@@ -126,7 +126,7 @@ def image_rows(
     observations: Mapping[str, int],
     supports: Mapping[str, tuple[int, int]],
     conflict: Mapping[str, Any] | None,
-    left_out: Mapping[str, str],
+    left_out: Mapping[str, Note],
 ) -> list[dict[str, Any]]:
     """What became of each photo, for registration.json. ``models`` are the names in each sub-model, best first;
     ``supports`` and ``conflict`` as stages/sfm/colmap/diagnosis.py finds them; ``left_out`` says why a camera cannot be
@@ -142,7 +142,7 @@ def image_rows(
             {
                 "file": name,
                 "registered": name in models[0],
-                "reason": reason,
+                **told(reason),
                 "keypoints": int(matches.keypoints[index]),
                 "observations": observations.get(name, 0),
             }
@@ -150,9 +150,15 @@ def image_rows(
     return entries
 
 
-def _contradiction(models: Sequence[Sequence[str]], conflict: Mapping[str, Any]) -> str:
+def told(reason: Note | None) -> dict[str, str | None]:
+    """Why a photo is unregistered, as registration.json has it."""
+    return {"reason": reason and reason.text, "reason_code": reason and reason.code}
+
+
+def _contradiction(models: Sequence[Sequence[str]], conflict: Mapping[str, Any]) -> Note:
     shares = f"shares {conflict['shared']} with this model and gives {conflict['different']} of them different poses"
-    return f"it belongs to a group of {len(models[conflict['group']])} photos that {shares}: repeated structure"
+    group = f"it belongs to a group of {len(models[conflict['group']])} photos that {shares}"
+    return Note("sfm.unregistered-repeated-structure", f"{group}: repeated structure")
 
 
 def repeated_structure(conflict: Mapping[str, Any], name_of: Mapping[str, str]) -> str:
@@ -171,39 +177,52 @@ def with_near_duplicates(entries: Sequence[dict[str, Any]], photos: Sequence[Pho
     known = {entry["file"]: entry for entry in entries}
     rows = []
     for photo in photos:
-        reason = f"a near-duplicate of {photo.near_duplicate_of}: it adds no baseline"
-        duplicate = {"file": photo.image_name, "registered": False, "reason": reason, "keypoints": 0, "observations": 0}
+        reason = Note(
+            "sfm.unregistered-near-duplicate", f"a near-duplicate of {photo.near_duplicate_of}: it adds no baseline"
+        )
+        duplicate = {
+            "file": photo.image_name,
+            "registered": False,
+            **told(reason),
+            "keypoints": 0,
+            "observations": 0,
+        }
         rows.append(known.get(photo.image_name, duplicate))
     return rows
 
 
 def _reason(
     index: int, names: Sequence[str], matches: Matches, models: Sequence[Sequence[str]], support: tuple[int, int]
-) -> str:
+) -> Note:
     """Why a photo is unregistered: the first link that is missing between its features and the model."""
     features, (seen, agreeing) = int(matches.keypoints[index]), support
     if not features:
-        return "it has no features: it is blurred, dark or without texture"
+        return Note("sfm.unregistered-no-features", "it has no features: it is blurred, dark or without texture")
     few = f" (it has only {features} features)" if features < MIN_FEATURES else ""
     mine = (matches.pairs == index).any(axis=1)
     if not mine.any():
-        return f"no other photo matches it{few}"
+        return Note("sfm.unregistered-no-match", f"no other photo matches it{few}")
     if others := [model for model in models[1:] if names[index] in model]:
-        return f"it belongs to a group of {len(others[0])} photos that does not connect to the model"
+        group = f"it belongs to a group of {len(others[0])} photos that does not connect to the model"
+        return Note("sfm.unregistered-other-group", group)
     partners = matches.pairs[mine].sum(axis=1) - index
     in_model = np.array([names[partner] in models[0] for partner in partners])
     if not in_model.any():
-        return f"it matches only unregistered photos ({len(partners)} of them){few}"
+        alone = f"it matches only unregistered photos ({len(partners)} of them){few}"
+        return Note("sfm.unregistered-partners", alone)
     if seen >= MIN_POSE_INLIERS and agreeing >= MIN_POSE_INLIERS:
-        return f"its pose is uncertain: {agreeing} of its {seen} matches with points of the model agree on one"
+        uncertain = f"its pose is uncertain: {agreeing} of its {seen} matches with points of the model agree on one"
+        return Note("sfm.unregistered-uncertain-pose", uncertain)
     if seen >= MIN_POSE_INLIERS:
         agree = f"{agreeing} of {seen} agree on one pose, and it takes {MIN_POSE_INLIERS}"
-        return f"its matches contradict each other: {agree}"
+        return Note("sfm.unregistered-contradictions", f"its matches contradict each other: {agree}")
+    pairs = f"all {int(in_model.sum())} of its pairs with registered photos"
     if matches.forward[mine][in_model].all():
-        return f"forward motion in all {int(in_model.sum())} of its pairs with registered photos: too little parallax"
+        return Note("sfm.unregistered-forward-motion", f"forward motion in {pairs}: too little parallax")
     if matches.planar[mine][in_model].all():
-        return f"pure rotation or a planar scene in all {int(in_model.sum())} of its pairs with registered photos"
-    return f"only {seen} of its features match points of the model, and it takes {MIN_POSE_INLIERS}{few}"
+        return Note("sfm.unregistered-rotation-or-plane", f"pure rotation or a planar scene in {pairs}")
+    points = f"only {seen} of its features match points of the model, and it takes {MIN_POSE_INLIERS}{few}"
+    return Note("sfm.unregistered-few-points", points)
 
 
 def why_no_model(photos: Sequence[Photo], matches: Matches, registered: int, points: int) -> StageError:

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from stages.contract import Note
 from stages.io.files import write_durably
 
 # Another initial pair maps all images anew, new features or a fisheye model cost as much as the first strategy: they
@@ -93,7 +94,7 @@ class Outcome:
     conflict: dict[str, Any] | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     match_graph: dict[str, Any] | None = None
-    excluded: dict[str, str] = field(default_factory=dict)
+    excluded: dict[str, Note] = field(default_factory=dict)
     sequence_broken: bool = False
     fits: bool = True
     global_mapping: dict[str, Any] | None = None
@@ -114,7 +115,7 @@ class StrategyLog:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         outcomes, skipped = read_kept(folder / LOG) or ([], {})
-        self.outcomes = [Outcome(**entry) for entry in outcomes]
+        self.outcomes = [Outcome(**entry | {"excluded": read_notes(entry["excluded"])}) for entry in outcomes]
         self.skipped: dict[str, str] = skipped
         self.abandoned: dict[str, str] = dict(read_kept(folder / ABANDONED))
 
@@ -150,6 +151,11 @@ class StrategyLog:
                 facts = dict.fromkeys(("registered", "points", "reprojection_px"))
                 rows.append({"strategy": name, **facts, "kept": False, "skipped": self.skipped[name]})
         return rows
+
+
+def read_notes(kept: Mapping[str, Sequence[str]]) -> dict[str, Note]:
+    """Notes by name, as JSON gives them back."""
+    return {name: Note(*note) for name, note in kept.items()}
 
 
 def abandon(folder: Path, name: str, why: str) -> None:

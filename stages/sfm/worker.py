@@ -105,7 +105,7 @@ def reconstruct(job: Job, send: Send) -> dict[str, Any]:
     }
 
 
-def _last_check(model: Any, database: Path, state: JobState) -> tuple[dict[str, Any], dict[str, str]]:
+def _last_check(model: Any, database: Path, state: JobState) -> tuple[dict[str, Any], dict[str, Note]]:
     """What the check finds in the finished model, for registration.json, and by name why images that fail leave it."""
     checked = check_model(model, database, state.job.seed)
     failed, left_out = checked.failed(), {}

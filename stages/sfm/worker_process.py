@@ -61,7 +61,7 @@ def run_worker(
                     latest.update(message)
                     if begins:  # a phase may take less than the live line waits
                         progress.update(*_describe(latest, len(photos)))
-            code = child.wait()
+            status = child.wait()
         finally:
             late = not overtime.is_alive()
             overtime.cancel()
@@ -70,17 +70,17 @@ def run_worker(
     if "result" not in latest:
         limit = config.max_seconds if late else None
         last = latest.get("fault") or _last_line(log)
-        raise _worker_failed(code, limit, latest["phase"], last, _without(latest["strategy"], code, late, log), log)
+        raise _worker_failed(status, limit, latest["phase"], last, _without(latest["strategy"], status, late, log), log)
     return latest["result"]
 
 
-def _without(strategy: str, code: int, late: bool, log: Path) -> str | None:
+def _without(strategy: str, status: int, late: bool, log: Path) -> str | None:
     """The hint to run again without the strategy that failed, which is noted; None for the first: it is always
     tried."""
-    if strategy == STRATEGIES[0].name or not (late or code):
+    if strategy == STRATEGIES[0].name or not (late or status):
         return None
     # Also where it was killed: most often for want of memory, and then it would be every time.
-    became = "was killed, most likely because memory ran out" if code == -signal.SIGKILL else "ended the program"
+    became = "was killed, most likely because memory ran out" if status == -signal.SIGKILL else "ended the program"
     abandon(log.parent / "strategies", strategy, OUT_OF_TIME if late else became)
     return f"Run again: the strategy {strategy!r} is then skipped. Log: {log}"
 
@@ -109,7 +109,7 @@ def _hand_over(stdin: IO[bytes], job: dict[str, Any]) -> None:
     try:
         stdin.write(json.dumps(job).encode() + b"\n")
         stdin.flush()
-    except BrokenPipeError:  # the child died at once; its exit code says how
+    except BrokenPipeError:  # the child died at once; its exit status says how
         return
 
 
@@ -138,7 +138,9 @@ def _last_line(log: Path) -> str:
     return lines[-1].strip() if lines else "it printed no message"
 
 
-def _worker_failed(code: int, limit: float | None, phase: str, last: str, without: str | None, log: Path) -> StageError:
+def _worker_failed(
+    status: int, limit: float | None, phase: str, last: str, without: str | None, log: Path
+) -> StageError:
     """``last``: the last message of the worker; ``without``: the hint where running again skips the strategy that
     failed."""
     free = shutil.disk_usage(log.parent).free
@@ -152,9 +154,9 @@ def _worker_failed(code: int, limit: float | None, phase: str, last: str, withou
             f"it took longer than {limit:g} s",
             without or "Raise --sfm.max-seconds, or give fewer photos; the matches found so far are kept.",
         )
-    if code < 0:
-        name = signal.Signals(-code).name
-        memory = code == -signal.SIGKILL
+    if status < 0:
+        name = signal.Signals(-status).name
+        memory = status == -signal.SIGKILL
         return StageError(
             "sfm.worker-killed",
             f"structure from motion was killed by {name} {where}",

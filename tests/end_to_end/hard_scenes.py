@@ -94,8 +94,16 @@ class Run(NamedTuple):
     @property
     def error(self) -> tuple[str, str, str]:
         """What, why and hint of the one error."""
+        return self._error["what"], self._error["why"], self._error["hint"]
+
+    @property
+    def error_code(self) -> str:
+        return self._error["code"]
+
+    @property
+    def _error(self) -> dict[str, Any]:
         (error,) = (event for event in self.events if event["event"] == "error")
-        return error["what"], error["why"], error["hint"]
+        return error
 
     def output(self, name: str) -> Path:
         """A file of the current results."""

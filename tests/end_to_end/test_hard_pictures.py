@@ -41,8 +41,8 @@ def transparent(picture: Picture, index: int) -> Picture:
 )
 def test_photos_of_one_colour_are_refused(develop: Callable, colour: str, tmp_path: Path) -> None:
     done = run(write_set(tmp_path / "set", develop=develop), tmp_path / "w.nerf")
-    assert done.code == 10
-    assert "12 photos" in done.error[0] and f"p00.png is {colour} everywhere" in done.error[1]
+    assert (done.code, done.error_code) == (10, "ingest.plain-photos")
+    assert "12 photos" in done.error[0] and "p00.png" in done.error[1] and colour in done.error[1]
 
 
 def saturated(picture: Picture, index: int) -> Picture:
@@ -104,8 +104,9 @@ def test_a_gigapixel_header_is_refused_before_anything_is_decoded(name: str, tmp
 
     (tmp_path / name).write_bytes(HUGE[name])
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(DecodeError, match=r"megapixels; the limit is 250|its header cannot be read"):
+    with pytest.raises(DecodeError) as refusal:
         decode(tmp_path / name)
+    assert refusal.value.code in ("ingest.too-large", "ingest.damaged-file")
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # KiB
 
 
@@ -116,8 +117,9 @@ def test_a_decompression_bomb_is_refused_by_its_pixels(tmp_path: Path) -> None:
     data = b"".join(rows.compress(bytes(1 + 3 * side)) for _ in range(side)) + rows.flush()
     (tmp_path / "bomb.png").write_bytes(png(side, side, data))
     assert (tmp_path / "bomb.png").stat().st_size < 1e7 and side**2 > MAX_PIXELS
-    with pytest.raises(DecodeError, match=r"17000×17000 is 289 megapixels; the limit is 250"):
+    with pytest.raises(DecodeError, match="17000×17000") as refusal:
         decode(tmp_path / "bomb.png")
+    assert refusal.value.code == "ingest.too-large"
 
 
 @pytest.mark.parametrize("text", ["tEXt", "zTXt", "iCCP"])
@@ -132,7 +134,7 @@ def test_a_picture_with_a_bomb_beside_its_pixels_is_harmless(text: str, tmp_path
     try:
         assert decode(tmp_path / "a.png").pixels.shape == (32, 32, 3)
     except DecodeError as refusal:
-        assert "damaged" in str(refusal)
+        assert refusal.code == "ingest.damaged-file"
 
 
 @pytest.mark.parametrize("size", [(65_534, 65_534), (1, 1), (0, 0)])

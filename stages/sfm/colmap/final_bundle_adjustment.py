@@ -29,7 +29,7 @@ class AdjustedModel:
     camera_models: list[dict[str, Any]]  # the comparison, a row per candidate (registration.json)
     notes: list[Note]
     uncertainty_px: dict[str, float]  # by the image's name
-    left_out: dict[str, str]  # by the image's name, why its camera cannot be used: it has no place any more
+    left_out: dict[str, Note]  # by the image's name, why its camera cannot be used: it has no place any more
 
 
 def final_bundle_adjustment(
@@ -94,11 +94,14 @@ def _camera(model: pycolmap.Reconstruction, image_id: int) -> pycolmap.Camera:
     return model.camera(model.image(image_id).camera_id)
 
 
-def _deregister_degenerate(model: pycolmap.Reconstruction, degenerate: dict[int, str]) -> dict[str, str]:
+def _deregister_degenerate(model: pycolmap.Reconstruction, degenerate: dict[int, str]) -> dict[str, Note]:
     """Take these photos out of the model: by name why. None where they are most of all: what is left is no scene."""
     if not degenerate or 2 * len(degenerate) >= model.num_reg_images():
         return {}
-    reasons = {model.image(image_id).name: f"its camera is degenerate: {why}" for image_id, why in degenerate.items()}
+    reasons = {
+        model.image(image_id).name: Note("sfm.unregistered-degenerate-camera", f"its camera is degenerate: {why}")
+        for image_id, why in degenerate.items()
+    }
     for image_id in degenerate:
         model.deregister_frame(model.image(image_id).frame_id)
     model.tear_down()  # their cameras go too
@@ -106,7 +109,7 @@ def _deregister_degenerate(model: pycolmap.Reconstruction, degenerate: dict[int,
     return reasons
 
 
-def _finished(model: pycolmap.Reconstruction, choice: CameraModels, left_out: dict[str, str]) -> AdjustedModel:
+def _finished(model: pycolmap.Reconstruction, choice: CameraModels, left_out: dict[str, Note]) -> AdjustedModel:
     notes, uncertainty = choice.notes, {}
     untold = "the uncertainty of the poses is unknown"
     try:

@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float, Int
 
+from stages.contract import Note
 from stages.sfm.colmap.correspondences import read_pair_matches
 from stages.sfm.colmap.database import copy_without_pairs, finish_copy, keep_inliers, unfinished_copy
 from stages.sfm.colmap.mapping import map_incrementally
@@ -94,7 +95,7 @@ def camera_poses(model: pycolmap.Reconstruction) -> Float[np.ndarray, "photos 3 
     return np.array(poses).reshape(-1, 3, 4)
 
 
-def reasons(model: pycolmap.Reconstruction, checked: Checked) -> dict[str, str]:
+def reasons(model: pycolmap.Reconstruction, checked: Checked) -> dict[str, Note]:
     """By name, why each photo that failed cannot stay."""
     check, found = checked.check, {}
     groups = int(check.misplaced.sum())
@@ -106,9 +107,11 @@ def reasons(model: pycolmap.Reconstruction, checked: Checked) -> dict[str, str]:
                 f"{against:,.0f} of its {agree + against:,.0f} verified matches with other photos contradict its pose"
             )
             together = f", and so for {groups - 1} more" if groups > 1 else ""
-            found[model.image(image_id).name] = f"{matches}{together}"
+            found[model.image(image_id).name] = Note("sfm.unregistered-misplaced", f"{matches}{together}")
         elif unlinked:
-            found[model.image(image_id).name] = "no verified match links it to the other photos"
+            found[model.image(image_id).name] = Note(
+                "sfm.unregistered-unlinked", "no verified match links it to the other photos"
+            )
     return found
 
 
@@ -139,7 +142,7 @@ def copy_consistent_matches(
 
 def drop_outside_main_segment(
     model: pycolmap.Reconstruction, checked: Checked, sequence: Sequence[int]
-) -> dict[str, str]:
+) -> dict[str, Note]:
     """Deregister images outside the longest segment of a broken capture ``sequence`` (image ids, none where it is not
     known): by name why."""
     fragmented = fragments_sequence(checked, sequence)
@@ -147,7 +150,7 @@ def drop_outside_main_segment(
     outside = outside_main_segment(_numbers(checked, sequence), checked.matches, checked.check, ORDER_OVERLAP)
     ids = [image_id for image_id, is_outside in zip(checked.ids, outside, strict=True) if is_outside]
     deregister(model, ids)
-    why = f"{neighbours} contradict its pose: repeated structure"
+    why = Note("sfm.unregistered-outside-sequence", f"{neighbours} contradict its pose: repeated structure")
     return {model.image(image_id).name: why for image_id in ids}
 
 

@@ -43,6 +43,7 @@ from stages.sfm.imported.orientation import fits_only_upright, pixel_map, stored
 from stages.sfm.imported.photo_names import other_spelling, photos_by_name
 from stages.sfm.imported.posed_photos import PosedPhoto, distinct, posed_photo, unusable, without_rays
 from stages.sfm.imported.transforms_intrinsics import contradictions, intrinsics_of, read_intrinsics
+from stages.sfm.registration import told
 
 # The root mean square stretch of a matrix beside its scale, as an angle, is about what its rotation is off by where the
 # numbers were rounded: 0.02° of three decimals, 0.2° of two. Beyond this a matrix is no rotation.
@@ -60,7 +61,7 @@ class ImportedPoses:
     ingest's ``images/``. ``notes`` are for the user."""
 
     model: SparseModel
-    left_out: dict[str, str]
+    left_out: dict[str, Note]
     test_files: list[str] | None
     notes: list[Note]
 
@@ -68,12 +69,13 @@ class ImportedPoses:
         """What became of each photo, for registration.json."""
         seen = np.bincount(self.model.view, minlength=len(self.model.images)).tolist()
         observations = {image.file: count for image, count in zip(self.model.images, seen, strict=True)}
+        without = Note("sfm.unregistered-no-imported-pose", "it has no imported pose")
         reasons = self.left_out | dict.fromkeys(observations)
         return [
             {
                 "file": file,
                 "registered": file in observations,
-                "reason": reasons.get(file, "it has no imported pose"),
+                **told(reasons.get(file, without)),
                 "keypoints": observations.get(file, 0),
                 "observations": observations.get(file, 0),
             }
@@ -142,8 +144,8 @@ def _from_transforms(
     return ImportedPoses(
         model=SparseModel.without_points(*distinct(kept)),
         left_out=left_out
-        | dict.fromkeys(found.unused, "it is in no split of the transforms file")
-        | dict.fromkeys(found.poseless, "its frame has no pose"),
+        | dict.fromkeys(found.unused, Note("sfm.unregistered-in-no-split", "it is in no split of the transforms file"))
+        | dict.fromkeys(found.poseless, Note("sfm.unregistered-frame-without-pose", "its frame has no pose")),
         test_files=kept_tests or None,
         notes=_notes(found.absent, unposed, posed, left_out) + notes,
     )

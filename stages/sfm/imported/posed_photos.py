@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf.geometry.scene import Camera
-from stages.contract import StageError
+from stages.contract import Note, StageError
 from stages.io.photos import Photo
 from stages.io.sparse_model import SparseImage
 from stages.sfm.colmap.cameras import native, no_ray, rescaled, share_without_ray, why_no_ray
@@ -75,7 +75,7 @@ def _at_size_of(photo: Photo, camera: Camera, where: str) -> Camera:
     return rescaled(camera, *size)
 
 
-def without_rays(posed: Collection[PosedPhoto]) -> dict[str, str]:
+def without_rays(posed: Collection[PosedPhoto]) -> dict[str, Note]:
     """Which photos have a camera without a ray for some of their pixels, by file, and what is to be said of it. Raises
     StageError, with a name, where half of them have: without these there is no scene."""
     lost = {camera: share_without_ray(native(camera)) for camera in {one.camera for one in posed}}
@@ -84,7 +84,10 @@ def without_rays(posed: Collection[PosedPhoto]) -> dict[str, str]:
         raise no_ray(bent[0].camera, lost[bent[0].camera], of=bent[0].name)
     why = "its imported camera cannot be used"
     return {
-        one.file: f"{why}: {why_no_ray(one.camera.model)} at {100 * lost[one.camera]:.3g}% of the pixels"
+        one.file: Note(
+            "sfm.unregistered-no-ray",
+            f"{why}: {why_no_ray(one.camera.model)} at {100 * lost[one.camera]:.3g}% of the pixels",
+        )
         for one in bent
     }
 

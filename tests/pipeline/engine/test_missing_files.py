@@ -30,7 +30,7 @@ def test_missing_render_cameras_stop_the_video_alone(tmp_path: Path, monkeypatch
     with Workspace(tmp_path / "w.nerf") as workspace:
         runner = Runner(workspace, settings, SilentDisplay())
         assert runner.found("render") is None and runner.found("evaluate") is not None
-    with pytest.raises(StageFailed, match=r"render: .*does not exist"):
+    with refused("pipeline.no-such-file", "render", path):
         go(machine, 300.0, **options)
 
 

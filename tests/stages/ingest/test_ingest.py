@@ -93,10 +93,12 @@ def test_refused_files_are_named_and_do_not_stop_the_rest(tmp_path: Path, progre
     assert result.line == "2 photos 32×24, one camera, no EXIF focal, 3 rejected"
     refused = read_json(tmp_path / "out/photos.json")["rejected"]
     assert [rejection["name"] for rejection in refused] == ["cut.jpg", "notes.jpg", "z copy of a.jpg"]
+    codes = [rejection["code"] for rejection in refused]
+    assert codes == ["ingest.damaged-file", "ingest.not-an-image", "ingest.identical"]
     assert refused == result.facts["rejected"]
     assert progress.codes == ["ingest.rejected"] * 3
-    for name, why in (("cut.jpg", "truncated"), ("notes.jpg", "text"), ("z copy of a.jpg", "identical to a.jpg")):
-        assert progress.names("ingest.rejected", name, why)
+    for rejection in refused:
+        assert progress.names("ingest.rejected", rejection["name"], rejection["reason"])
 
 
 def test_too_few_photos_in_words_that_fit(tmp_path: Path, progress: Any) -> None:

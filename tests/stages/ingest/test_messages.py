@@ -71,6 +71,18 @@ def test_photos_beside_an_images_folder_are_said(tmp_path: Path, progress: Any) 
     assert progress.names("ingest.photos-beside-images", "2 photos", f"{tmp_path}/in", "images/")
 
 
+@pytest.mark.parametrize("folder", ["images", "images_2"])
+def test_smaller_copies_of_photos_are_named(folder: str, tmp_path: Path, progress: Any) -> None:
+    put(tmp_path / "in" / folder, "a.jpg", "b.jpg")
+    for photo in (tmp_path / "in" / folder).iterdir():
+        (tmp_path / "in/images_8").mkdir(exist_ok=True)
+        Image.open(photo).resize((16, 16)).save(tmp_path / "in/images_8" / photo.name)
+    ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
+    assert [photo.name for photo in read_photos(tmp_path / "out")] == ["a.jpg", "b.jpg"]
+    assert progress.codes == ["ingest.smaller-copies"]
+    assert progress.names("ingest.smaller-copies", f"{folder}/", "images_8/")
+
+
 def test_where_it_fails_all_refusals_are_said_by_reason(tmp_path: Path, progress: Any) -> None:
     folder = put(tmp_path / "in", "a.jpg")
     put(folder / "masks", "stray.png")

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from stages.contract import StageError
 from stages.ingest.auxiliary_files import pair_masks
@@ -73,6 +74,46 @@ def test_images_inside_is_the_root(tmp_path: Path) -> None:
     transforms(tmp_path / "transforms.json", "images/a.jpg")
     source = find_source(tmp_path)
     assert (source.kind, source.root, names(source)) == ("photos", tmp_path / "images", ["a.jpg"])
+
+
+def sizes(root: Path, **folders: int) -> None:
+    """Photos a, b of so many pixels a side in each folder."""
+    for folder, side in folders.items():
+        (root / folder).mkdir(parents=True)
+        for name in ("a.png", "b.png"):
+            Image.new("RGB", (side, side)).save(root / folder / name)
+
+
+@pytest.mark.parametrize(
+    ("folders", "root", "found"),
+    [
+        ({"images_2": 64, "images_4": 32, "images_8": 16}, "images_2", ["a.png", "b.png"]),
+        ({"images_8": 32, "images_16": 16}, "images_8", ["a.png", "b.png"]),
+        ({"images_4": 32}, "images_4", ["a.png", "b.png"]),
+        (
+            {"images_1": 64, "images_2": 64},
+            ".",
+            ["images_1/a.png", "images_1/b.png", "images_2/a.png", "images_2/b.png"],
+        ),
+        ({"images_2": 64, "images_4": 32, "more": 64}, ".", None),
+    ],
+    ids=["without images", "by number", "one", "two cameras", "others beside"],
+)
+def test_of_reduced_folders_the_largest_is_the_root(
+    folders: dict[str, int], root: str, found: list[str] | None, tmp_path: Path
+) -> None:
+    sizes(tmp_path, **folders)
+    source = find_source(tmp_path)
+    assert source.root == tmp_path / root
+    assert names(source) == (found or sorted(f"{folder}/{name}" for folder in folders for name in ("a.png", "b.png")))
+
+
+def test_cameras_of_full_photos_serve_reduced_ones(tmp_path: Path) -> None:
+    sizes(tmp_path, images_2=64, images_4=32)
+    cameras = transforms(tmp_path / "transforms.json", "images/a.png", "images/b.png")
+    source = find_source(tmp_path, cameras)
+    assert (source.root, names(source)) == (tmp_path / "images_2", ["a.png", "b.png"])
+    assert unused_cameras(find_source(tmp_path)) == cameras
 
 
 def test_images_inside_without_photos_is_not_the_root(tmp_path: Path) -> None:
@@ -456,7 +497,7 @@ def test_a_folder_that_goes_while_it_is_listed(tmp_path: Path, monkeypatch: pyte
         shutil.rmtree(folder)
         return True
 
-    monkeypatch.setattr("stages.ingest.listing._is_photo_folder", enters)
+    monkeypatch.setattr("stages.ingest.listing.is_photo_folder", enters)
     assert refusal(tmp_path).what == f"cannot read {tmp_path / 'a'}"
 
 

@@ -116,7 +116,7 @@ def test_a_photo_keeps_its_folder_in_colmap_names() -> None:
 
 def test_photos_json_round_trips(tmp_path: Path) -> None:
     photos = [photo(), photo(name="b", focal_px=None, focal_source=None)]
-    write_photos(tmp_path, photos, [Rejection("c.jpg", "truncated")], {"./b": "b"})
+    write_photos(tmp_path, photos, [Rejection("c.jpg", "ingest.damaged-file", "truncated")], {"./b": "b"})
     assert read_photos(tmp_path) == photos
     assert read_frame_names(tmp_path) == {"./b": "b"}
 

@@ -16,7 +16,7 @@ from nerf.fields.interface import Rendering
 from nerf.geometry.region_of_interest import CaptureType
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages import render
-from stages.contract import StageError, run_stage
+from stages.contract import run_stage
 from stages.io.files import read_json, write_json
 from stages.io.transforms_export import transforms
 from stages.render.path import CameraPath, make_path, median_camera, path_from_file, path_rays, resized
@@ -267,17 +267,17 @@ def test_blender_angles_are_understood_without_sizes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("frame", "words"),
+    ("frame", "named"),
     [
-        ({"transform_matrix": [[1, 2], [3, 4]]}, "cannot use frame 0 of t.json: its transform_matrix is not 4 × 4"),
-        ({"transform_matrix": 7}, "cannot use frame 0 of t.json: its transform_matrix is not 4 × 4"),
-        ({"transform_matrix": None}, "cannot use frame 0 of t.json: its transform_matrix is not"),
-        ({"transform_matrix": np.zeros((4, 4)).tolist()}, "its transform_matrix mirrors or is singular"),
-        ({"transform_matrix": np.eye(4).tolist(), "fl_x": -3}, "a focal length of -3 × -3 pixels"),
+        ({"transform_matrix": [[1, 2], [3, 4]]}, "4 × 4"),
+        ({"transform_matrix": 7}, "4 × 4"),
+        ({"transform_matrix": None}, "transform_matrix"),
+        ({"transform_matrix": np.zeros((4, 4)).tolist()}, "singular"),
+        ({"transform_matrix": np.eye(4).tolist(), "fl_x": -3}, "-3 × -3"),
     ],
 )
-def test_unusable_frames_are_named(frame, words: str, tmp_path: Path) -> None:
-    with pytest.raises(StageError, match=words):
+def test_unusable_frames_are_named(frame, named: str, tmp_path: Path) -> None:
+    with refused("render.unusable-frame", "frame 0 of t.json", named):
         given_path({"frames": [{"file_path": "a"} | frame]}, scene_with(ring(5)), tmp_path)
 
 

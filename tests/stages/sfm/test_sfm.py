@@ -165,14 +165,14 @@ def test_strangers_are_named_alpha_and_mixed_sizes_work(inputs: dict[str, Path],
         "strategy-useless",
         "strategy-useless",
         "unregistered",
-        "unregistered-reason",
+        "unregistered-no-match",
     ]
     assert progress.names("sfm.matching-time", "36 pairs") and progress.names("sfm.matching-time", "8 pairs")
     assert progress.names("sfm.strategy", "1 of 9 photos", "relaxed ratio test")
     assert progress.names("sfm.strategy-useless", "1 of 9 photos", "fisheye", "features")
     assert progress.names("sfm.strategy-useless", "initial pair", "another seed", "global mapping")
     assert progress.names("sfm.unregistered", "1 of 9 photos")
-    assert progress.names("sfm.unregistered-reason", "stranger.png")
+    assert progress.names("sfm.unregistered-no-match", "stranger.png")
     account = read_json(tmp_path / "sfm/registration.json")
     assert [image["file"] for image in account["images"] if not image["registered"]] == ["stranger.png"]
     tried = {row["strategy"]: row["skipped"] for row in account["strategies"]}
@@ -202,6 +202,7 @@ def test_near_duplicates_are_unmatched_and_masks_exclude_features(
     assert (account["photos"], account["registered"]) == (9, 8)
     assert [image["file"] for image in account["images"]] == list(images)
     assert photos[0].name in account["images"][1].pop("reason")
+    assert account["images"][1].pop("reason_code") == "sfm.unregistered-near-duplicate"
     assert account["images"][1] == {
         "file": photos[1].image_name,
         "registered": False,
@@ -271,8 +272,8 @@ def test_one_degenerate_camera_does_not_end_the_run(
     run_stage(sfm, SMALL, ingested(tmp_path / "ingest", images), tmp_path / "sfm", progress)
     assert progress.names("sfm.camera-replaced", "1 photo", "it is wrong", "SIMPLE_PINHOLE")
     account, model = read_json(tmp_path / "sfm/registration.json"), read_model(tmp_path / "sfm/sparse")
-    reasons = {image["file"]: image["reason"] for image in account["images"] if not image["registered"]}
-    assert reasons == ({"photo_003.jpg": "its camera is degenerate: it is wrong"} if always else {})
+    reasons = {image["file"]: image["reason_code"] for image in account["images"] if not image["registered"]}
+    assert reasons == ({"photo_003.jpg": "sfm.unregistered-degenerate-camera"} if always else {})
     assert [camera.model for camera in model.cameras if camera.width == 220] == ([] if always else ["SIMPLE_PINHOLE"])
     assert len(model.images) == account["registered"] == 8 - len(reasons)
     assert [image["observations"] for image in account["images"] if image["registered"]] == (

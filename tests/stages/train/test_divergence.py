@@ -1,6 +1,5 @@
 """Rates far too high, numbers that are none, damaged checkpoints: never a bad model that looks like a good one."""
 
-import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -153,11 +152,8 @@ def test_rays_that_are_no_numbers_end_training_by_name(
         getattr(dataset, table)[number, ::2] = poison
 
     spoil_at(5, lambda trainer: poisoned(trainer.dataset), monkeypatch, kind)
-    with pytest.raises(StageError) as failure:
+    with refused("train.diverged", "geometry of rays", "3 roll-backs", "cameras"):
         trained(kind, inputs, tmp_path / "train", progress, steps=10)
-    assert failure.value.what == "training diverged"
-    assert re.match("the geometry of rays of step [0-9]+ is not finite, after 3 roll-backs", failure.value.why)
-    assert "Check the cameras" in failure.value.hint
     assert progress.names("train.rolled-back", "the geometry of rays of step 5")
     assert (tmp_path / "train" / "nonfinite_5.safetensors").is_file()
 
@@ -248,8 +244,9 @@ def test_a_float_photo_with_nan_is_refused_by_name(tmp_path: Path, poison: float
     values[3, 4] = poison
     Image.fromarray(values).save(tmp_path / "poisoned.tif")
     assert decode(tmp_path / "fine.tif").pixels.shape == (20, 30, 3)
-    with pytest.raises(DecodeError, match=r"^1 of its 600 pixels are NaN or infinite$"):
+    with pytest.raises(DecodeError, match="1 of its 600") as refusal:
         decode(tmp_path / "poisoned.tif")
+    assert refusal.value.code == "ingest.not-finite"
 
 
 @pytest.mark.parametrize(
@@ -257,8 +254,9 @@ def test_a_float_photo_with_nan_is_refused_by_name(tmp_path: Path, poison: float
 )
 def test_openexr_and_radiance_files_are_no_photos(tmp_path: Path, head: bytes) -> None:
     (tmp_path / "light.bin").write_bytes(head + bytes(range(256)))
-    with pytest.raises(DecodeError, match="not an image of a known format"):
+    with pytest.raises(DecodeError) as refusal:
         decode(tmp_path / "light.bin")
+    assert refusal.value.code == "ingest.not-an-image"
 
 
 def _forget(trainer: Any) -> None:

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from nerf.training.trainer import NonFinite, StepResult
-from stages.contract import StageError
 from stages.train import loop
 from stages.train.checkpoints import latest_checkpoint
 from stages.train.loop import TrainingRun
@@ -72,15 +71,9 @@ def test_a_non_finite_step_is_rolled_back(tmp_path: Path, progress) -> None:
 
 def test_after_three_roll_backs_training_fails_by_name(tmp_path: Path, progress) -> None:
     run = run_in(tmp_path, progress, make=non_finite(at=25, until_rate=0))
-    with pytest.raises(StageError) as failure:
+    batch = tmp_path / "nonfinite_25.safetensors"
+    with refused("train.diverged", "step 25", "3 roll-backs", "--train.learning-rate", batch):
         run.train()
-    assert failure.value.what == "training diverged"
-    assert (
-        failure.value.why == "the loss of step 25 is not finite, after 3 roll-backs that each halved the learning rate"
-    )
-    assert failure.value.hint == (
-        f"Try a tenth of --train.learning-rate; the batch is kept in {tmp_path / 'nonfinite_25.safetensors'}."
-    )
 
 
 def dying(seeds: int, opacity: float, grey: float) -> Callable[[int], OneNumber]:
@@ -115,10 +108,8 @@ def test_a_collapsed_field_is_restarted_with_another_seed(
 def test_a_field_that_stays_collapsed_fails_by_name(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop, "MIN_HEALTHY_STEPS", 10)
     run = run_in(tmp_path, progress, make=dying(9, opacity=0.0, grey=0.5))
-    with pytest.raises(StageError) as failure:
+    with refused("train.collapsed", "10 steps", "opacity 0e+00", "3 different seeds"):
         run.train()
-    assert failure.value.what == "the field does not learn"
-    assert failure.value.why == "after 10 steps it is empty (mean opacity 0e+00), with 3 different seeds"
 
 
 def test_the_curve_ends_with_the_run_and_is_on_record(
@@ -154,7 +145,7 @@ def test_what_was_measured_of_steps_taken_back_is_forgotten(
 def test_a_field_improved_by_more_steps_is_of_use(tmp_path: Path, progress) -> None:
     first = run_in(tmp_path / "first", progress, make=dying(1, 0.0, 0.5))
     first.train()
-    assert first.state.failure_reason == "it is empty (mean opacity 0e+00)"
+    assert "opacity 0e+00" in str(first.state.failure_reason)
     more = run_in(tmp_path / "more", progress, TrainingBudget(20, None, tmp_path / "first"))
     more.train()
     assert more.state.failure_reason is None

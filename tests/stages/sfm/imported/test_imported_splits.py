@@ -42,7 +42,7 @@ def test_photos_in_no_split_are_left_out_by_name(read) -> None:
     known = read([frame(i) for i in range(3)], **LENS, train_filenames=["0"], test_filenames=["2"], val_filenames=["1"])
     assert [image.file for image in known.model.images] == ["a0.png", "a2.png"]
     assert known.test_files == ["a2.png"]
-    assert list(known.left_out) == ["a1.png"]
+    assert [(file, why.code) for file, why in known.left_out.items()] == [("a1.png", "sfm.unregistered-in-no-split")]
     assert codes(known.notes) == ["sfm.in-no-split"] and "ä1.png" in known.notes[0].text
 
 

@@ -290,7 +290,9 @@ def test_frames_without_a_pose_are_left_out_and_named(read, none: Any) -> None:
     known = read([frame(0), frame(1, transform_matrix=none), frame(2)], **LENS)
     assert [image.file for image in known.model.images] == ["a0.png", "a2.png"]
     assert codes(known.notes) == ["sfm.frames-without-pose"] and "ä1.png" in known.notes[0].text
-    assert known.left_out == {"a1.png": "its frame has no pose"}
+    assert [(file, why.code) for file, why in known.left_out.items()] == [
+        ("a1.png", "sfm.unregistered-frame-without-pose")
+    ]
     with refused("sfm.no-poses", "transforms.json", "all 3 frames"):
         read([frame(i, transform_matrix=none) for i in range(3)], **LENS)
 
@@ -392,7 +394,7 @@ def test_frames_without_photo_and_photos_without_frame_are_named(read) -> None:
     known = read([frame(0), frame(1), frame(7)], **LENS)
     assert codes(known.notes) == ["sfm.no-photo", "sfm.no-camera"] and "ä2.png" in known.notes[1].text
     assert [entry["registered"] for entry in known.account(PHOTOS)] == [True, True, False]
-    assert known.account(PHOTOS)[2]["reason"] == "it has no imported pose"
+    assert known.account(PHOTOS)[2]["reason_code"] == "sfm.unregistered-no-imported-pose"
 
 
 def test_no_frame_with_a_photo_is_an_error(read) -> None:
