@@ -29,8 +29,8 @@ _MASK = re.compile(r"(.+[ ._-])?masks?([ ._-]?\d+)?", re.IGNORECASE)
 # Of a depth map there is a photo, but for a few that were lost; of photos in grey there need not be any in colour.
 _MIN_COLOURED = 0.9
 
-Stored = Literal["colour", "grey", "deep grey"]
-"""How a file stores its values; the last of 16 bits or floats."""
+Stored = Literal["colour", "grey", "deep grey", "black and white"]
+"""How a file stores its values: "deep grey" in 16 bits or floats, "black and white" in nothing between."""
 _Key = tuple[PurePosixPath, str]  # a folder, and what a photo in it is called
 
 
@@ -60,6 +60,12 @@ def depth_maps(stored: Mapping[str, Stored]) -> set[str]:
     deep = {name for name, kind in stored.items() if kind == "deep grey"}
     colour = sum(kind == "colour" for kind in stored.values())
     return deep if colour >= _MIN_COLOURED * len(deep) else set()
+
+
+def masks_by_values(stored: Mapping[str, Stored]) -> set[str]:
+    """Which files are masks by their values, whatever they are called: those in black and white among others."""
+    found = {name for name, kind in stored.items() if kind == "black and white"}
+    return found if len(found) < len(stored) else set()
 
 
 def marks_ignored(name: str) -> bool:

@@ -22,7 +22,7 @@ from stages.contract import Note, Progress, StageError
 from stages.hardware.device import processors
 from stages.hardware.memory import at_once, check_memory
 from stages.ingest import messages
-from stages.ingest.auxiliary_files import Stored, depth_maps, pair_masks
+from stages.ingest.auxiliary_files import Stored, depth_maps, masks_by_values, pair_masks
 from stages.ingest.decoding import CameraKey, DecodeError, decode, pixel_count
 from stages.ingest.exif import GpsPosition
 from stages.ingest.masks import are_of_stored_pixels, read_mask
@@ -112,9 +112,10 @@ def convert(source: Source, max_frames: int, folder: Path, progress: Progress) -
     waiting.mkdir(exist_ok=True)
     taken, rejected, notes = _take_all(source, max_frames, waiting, progress)
     if source.kind == "photos":
-        deep = depth_maps({photo.name: photo.stored for photo in taken})
-        taken = [photo for photo in taken if photo.name not in deep]
-        notes += messages.excluded_by_values(sorted(deep))
+        kinds = {photo.name: photo.stored for photo in taken}
+        deep, masks = depth_maps(kinds), masks_by_values(kinds)
+        taken = [photo for photo in taken if photo.name not in deep | masks]
+        notes += messages.excluded_by_values(sorted(deep)) + messages.excluded_masks(sorted(masks))
         taken, duplicates = _without_duplicates(taken)
         rejected = sorted(rejected + duplicates, key=lambda rejection: rejection.name)
     notes += [Note("ingest.assumed", f"{shown(t.name)}: {assumed}") for t in taken for assumed in t.notes]

@@ -29,6 +29,7 @@ from stages.io.pixels import pillow
 MAX_PIXELS = 250_000_000
 _SRGB_TOLERANCE = 2  # of 255: profiles closer than this to sRGB are sRGB written by another hand
 MIN_SIDE_PX = 16
+NEARLY, MIN_BLACK_AND_WHITE = 16, 0.95  # what JPEG leaves of black and white, and of how much of a mask
 # EPS and its like run interpreters; RAW_EXTENSIONS files would be read as their thumbnails.
 _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "HEIF", "AVIF", "JPEG2000")
 _DEEP_GREY = ("I", "I;16", "I;16L", "I;16B", "F")
@@ -190,7 +191,7 @@ def _convert(image: Image.Image, stored_plainly: bool, lossy: bool, turned: int 
         exposure_ev=exposure_from_exif(tags),
         clock_s=clock_from_exif(tags),
         suffix=(".png" if image.format == "PNG" else ".jpg") if copy else None,
-        stored=_stored(image.mode),
+        stored="black and white" if is_black_and_white(pixels) else _stored(image.mode),
         lossy=lossy,
         panorama=is_panorama(pixels, image.info.get("xmp")),
         notes=tuple(notes),
@@ -210,6 +211,18 @@ def _stored(mode: str) -> Stored:
     if mode in _DEEP_GREY:
         return "deep grey"
     return "grey" if mode in ("1", "L", "LA") else "colour"
+
+
+def is_black_and_white(pixels: np.ndarray) -> bool:
+    """Whether (h, w, 3 or 4) uint8 has both black and white and next to nothing else, as masks do."""
+    dark = bright = np.zeros(0, bool)
+    for step in (16, 1):  # of most photos a few pixels tell
+        some = pixels[::step, ::step, :3]
+        darkest, brightest = some.min(axis=2), some.max(axis=2)
+        dark, bright = brightest <= NEARLY, darkest >= 255 - NEARLY
+        if (dark | bright).mean() < MIN_BLACK_AND_WHITE or (brightest - darkest > NEARLY).any():
+            return False
+    return bool(dark.any() and bright.any())
 
 
 def _is_lossy(image: Image.Image, path: Path) -> bool:

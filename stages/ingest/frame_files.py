@@ -168,7 +168,8 @@ def _as_paths(name: str) -> tuple[str, ...]:
     if name.startswith("file://"):
         return (_decoded(name.removeprefix("file://")),)
     turned = name.replace("\\", "/")
-    return name, turned, _decoded(turned)
+    path = re.split("[?#]", turned)[0] if "://" in turned else turned
+    return name, turned, _decoded(path)
 
 
 def _decoded(url: str) -> str:
@@ -179,7 +180,10 @@ def _decoded(url: str) -> str:
 
 
 def _relative(name: str, folders: tuple[Path, ...]) -> str | None:
-    """``name`` relative to the folder that it lies in if it is absolute; None where it lies in none of them."""
+    """``name`` relative to the folder that it lies in if it is absolute; None where it lies in none of them, as URLs
+    do."""
+    if "://" in name:
+        return None
     if not (PurePosixPath(name).is_absolute() or PureWindowsPath(name).is_absolute()):
         return name
     inside = (folder for folder in folders if PurePosixPath(name).is_relative_to(folder))

@@ -137,6 +137,16 @@ def excluded_by_values(files: Sequence[str]) -> list[Note]:
     return [Note("ingest.depth-maps", words)]
 
 
+def excluded_masks(files: Sequence[str]) -> list[Note]:
+    """A note on files among photos that are black and white alone."""
+    if not files:
+        return []
+    count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
+    named = listed([shown(name) for name in files], 3)
+    words = f"{count} excluded as masks, black and white among photos: {named}. To use masks, whose black is ignored"
+    return [Note("ingest.black-and-white", f"{words}, name them masks/NAME.png after their photos")]
+
+
 def bracketed(brackets: Brackets) -> str:
     """The note on places that were photographed with several exposures each."""
     last = brackets.exposures - 1

@@ -26,14 +26,15 @@ NO_PANORAMAS = "panoramas are not supported"
 # Keys that tell one thing together: a frame that has one of a group has the group, and the file's count no more.
 FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 CENTRE = ("cx", "cy")
-DISTORTION = ("distortion_params", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
+TERM_LISTS = ("distortion", "dist", "dist_coeffs", "distortion_coeffs", "distortion_coefficients", "D")
+DISTORTION = (*TERM_LISTS, "distortion_params", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
 CAMERA_MODEL = ("camera_model", "is_fisheye", *OTHER_CAMERA_MODELS)
 SIZE = ("w", "h")
 OF_INTRINSICS = {*FOCAL, *CENTRE, *DISTORTION, *CAMERA_MODEL, *SIZE}
 IN_PIXELS = {"fl_x": "w", "fl_y": "h", "cx": "w", "cy": "h"}  # of a picture of that side
 # How other programs spell these keys, and where they keep them: in a block of their own, or as a matrix.
 SPELLINGS = {"fx": "fl_x", "fy": "fl_y", "width": "w", "height": "h"}
-BLOCKS = ("camera", "intrinsics", "camera_intrinsics", "intrinsic_matrix", "camera_matrix", "K")
+BLOCKS = ("camera", "intrinsics", "camera_intrinsics", "distortion", "intrinsic_matrix", "camera_matrix", "K")
 SAME_WITHIN = 0.01  # two focal lengths, relatively: files are rounded
 MAX_SKEW = 1e-3  # of a focal length: what rounding leaves
 MAX_KEYS = 5  # in an error
@@ -84,7 +85,7 @@ def _of_block(name: str, block: Any) -> dict[str, Any]:
     if isinstance(block, Mapping):
         known = OF_INTRINSICS | SPELLINGS.keys()
         return {key: value for key, value in block.items() if key in known}
-    if not isinstance(block, list):
+    if not isinstance(block, list) or name in TERM_LISTS:
         return {}
     numbers = [number for row in block for number in (row if isinstance(row, list) else [row])]
     values = np.array([_finite(number, name) for number in numbers])
@@ -186,6 +187,11 @@ def why_unusable(camera: Camera) -> str | None:
         pixels = " × ".join(f"{value:.5g}" for value in focal)
         why = f"a focal length of {pixels} pixels is impossible for a photo of {camera.width}×{camera.height}"
         return f"{why}; it may be in image widths or in millimetres" if 0 < max(focal) < MIN_FOCAL_PX else why
+    if centre and all(0 < value <= 1 < longer / MIN_FOCAL_PX for value in centre):
+        at = ", ".join(f"{value:.5g}" for value in centre)
+        return (
+            f"its principal point ({at}) is in a corner of the photo; it may be in image widths, and belongs in pixels"
+        )
     if max(map(abs, centre), default=0.0) > MAX_CENTRE_OFFSET * longer:
         at = ", ".join(f"{value:.5g}" for value in centre)
         return f"its principal point ({at}) is far outside its {camera.width}×{camera.height} pixels"
@@ -193,7 +199,14 @@ def why_unusable(camera: Camera) -> str | None:
 
 
 def _with_named_terms(values: Mapping[str, Any]) -> Mapping[str, Any]:
-    """``values`` with ``distortion_params`` under the names of its terms."""
+    """``values`` with ``distortion_params`` under the names of its terms. Raises ValueError for distortion in a list
+    of another order, which nobody defines."""
+    for name in TERM_LISTS:
+        terms = values.get(name)
+        if terms is not None and not isinstance(terms, Mapping) and np.array(terms, dtype=object).any():
+            raise ValueError(
+                f"it has distortion as {name}, a list of no defined order; write k1, k2, p1, p2, k3 instead"
+            )
     if "distortion_params" not in values:
         return values
     terms = values["distortion_params"]

@@ -128,7 +128,13 @@ def test_ends_that_two_photos_share_are_named(tmp_path: Path, written: str) -> N
 
 
 @pytest.mark.parametrize(
-    "written", ["images/photo%201%20%C3%A9.jpg", "file:///home/me/photo%201%20é.jpg", "file://C:/me/photo%201%20é.jpg"]
+    "written",
+    [
+        "images/photo%201%20%C3%A9.jpg",
+        "file:///home/me/photo%201%20é.jpg",
+        "file://C:/me/photo%201%20é.jpg",
+        "https://host/set/photo%201%20é.jpg?raw=1#x",
+    ],
 )
 def test_paths_may_be_urls(tmp_path: Path, written: str) -> None:
     touch(tmp_path, "images/photo 1 é.jpg", "images/100%25.jpg")

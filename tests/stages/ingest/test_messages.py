@@ -83,6 +83,19 @@ def test_smaller_copies_of_photos_are_named(folder: str, tmp_path: Path, progres
     assert progress.names("ingest.smaller-copies", f"{folder}/", "images_8/")
 
 
+@pytest.mark.parametrize("name", ["sky_masks/{}.png", "mattes/{}.jpg", "{}_sky.png"])
+def test_masks_by_any_name_are_no_photos(name: str, tmp_path: Path, progress: Any) -> None:
+    folder = put(tmp_path / "in", "a.jpg", "b.jpg", "c.jpg")
+    for index, photo in enumerate("abc"):
+        mask = np.zeros((24, 32), np.uint8)
+        mask[4 + index :, 10:] = 255
+        (folder / name.format(photo)).parent.mkdir(exist_ok=True)
+        Image.fromarray(mask).save(folder / name.format(photo), quality=90)
+    ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
+    assert [photo.name for photo in read_photos(tmp_path / "out")] == ["a.jpg", "b.jpg", "c.jpg"]
+    assert progress.codes == ["ingest.black-and-white"] and progress.names("ingest.black-and-white", name.format("a"))
+
+
 def test_where_it_fails_all_refusals_are_said_by_reason(tmp_path: Path, progress: Any) -> None:
     folder = put(tmp_path / "in", "a.jpg")
     put(folder / "masks", "stray.png")

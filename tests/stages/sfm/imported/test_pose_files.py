@@ -130,6 +130,7 @@ MATRIX = [[50.0, 0, 31], [0, 52, 19], [0, 0, 1]]
     [
         {"fx": 50.0, "fy": 52.0, "cx": 31.0, "cy": 19.0, "width": W, "height": H},
         {"intrinsics": LENS},
+        {"camera": LENS, "distortion": {"k1": 0.0}, "dist_coeffs": [0.0, 0, 0, 0, 0]},
         {"camera": LENS | {"name": "phone"}},
         {"camera": {"fx": 50.0, "fy": "52", "cx": 31.0, "cy": 19.0, "width": W, "height": H}},
         {"intrinsics": MATRIX},
@@ -271,6 +272,9 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"distortion_params": [0, 0, 0, 0.1, 0, 0]}, r"k4, .*FULL_OPENCV"),
         ({"is_fisheye": True, "k5": 0.1}, r"a fisheye with k5 or k6"),
         ({"sx1": 0.1}, r"sx1 or sy1, .*THIN_PRISM_FISHEYE"),
+        ({"dist_coeffs": [0.1, 0.0, 0.0, 0.0]}, r"dist_coeffs.*k1, k2, p1, p2"),
+        ({"camera": {"distortion": [0.1, 0.0, 0.0, 0.0]}}, r"distortion.*k1, k2, p1, p2"),
+        ({"cx": 0.5, "cy": 0.5}, r"principal point \(0\.5, 0\.5\)"),
     ],
 )
 def test_what_is_no_camera_is_refused_by_name(read, changes: dict[str, Any], message: str) -> None:
