@@ -5,7 +5,7 @@ import gzip
 import json
 import struct
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
@@ -16,14 +16,14 @@ from stages.viewer.contents import Contents
 
 FILES = Path(__file__).with_name("page")
 SHADERS = ("space", "field", "march", "overlay")
-SCRIPTS = ("geometry", "contents", "graphics", "renderer", "overlay", "navigation", "path", "panels", "main")
+SCRIPTS = ("geometry", "contents", "graphics", "renderer", "overlay", "navigation", "path", "panels", "live", "main")
 ALIGNMENT = 8  # of a section, for typed arrays
 
 
 def save(contents: Contents, folder: Path) -> StageResult:
     """Write viewer.html."""
     payload = packed(contents)
-    text = page(contents.header["field"] is not None, payload)
+    text = page("still" if contents.header["field"] is not None else "not drawn", payload)
     (folder / "viewer.html").write_text(text, "utf-8")
     size = (folder / "viewer.html").stat().st_size
     if contents.loss_db is None:
@@ -35,25 +35,29 @@ def save(contents: Contents, folder: Path) -> StageResult:
 
 
 def packed(contents: Contents) -> str:
-    """Header and sections as gzip in base64: the header's length, the header, the sections at the places that it says,
-    counted from behind the header. Names of photos stand in there alone, so no HTML ever holds them."""
+    """:func:`binary` as gzip in base64. Names of photos stand in there alone, so no HTML ever holds them."""
+    return base64.b64encode(gzip.compress(binary(contents), 9, mtime=0)).decode("ascii")
+
+
+def binary(contents: Contents) -> bytes:
+    """The header's length, the header in JSON, the sections at the places that it says, counted from behind the header,
+    each as typed arrays want it."""
     places, body = dict[str, tuple[int, int]](), bytearray()
     for name, content in contents.sections.items():
         places[name] = len(body), len(content)
         body += content + bytes(-len(content) % ALIGNMENT)
     header = json.dumps({**contents.header, "sections": places}, allow_nan=False).encode()
     header += b" " * (-(len(header) + 4) % ALIGNMENT)
-    whole = struct.pack("<I", len(header)) + header + bytes(body)
-    return base64.b64encode(gzip.compress(whole, 9, mtime=0)).decode("ascii")
+    return struct.pack("<I", len(header)) + header + bytes(body)
 
 
-def page(drawn: bool, payload: str) -> str:
-    """The HTML around it."""
+def page(kind: Literal["still", "not drawn", "live"], payload: str = "") -> str:
+    """The HTML around the contents; of a training at work, ``live``, these come from a server."""
     environment = Environment(
         loader=FileSystemLoader(FILES), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
-    parts: dict[str, Any] = {"drawn": drawn, "payload": Markup(payload), "style": Markup(_text("style.css"))}
-    shaders = json.dumps({name: _text(f"{name}.glsl") for name in SHADERS})
+    parts: dict[str, Any] = {"kind": kind, "payload": Markup(payload), "style": Markup(_text("style.css"))}
+    shaders = json.dumps({name: _text(f"shaders/{name}.glsl") for name in SHADERS})
     script = "\n".join([f"const SHADERS = {shaders};", *(_text(f"{name}.js") for name in SCRIPTS)])
     return environment.get_template("page.html.j2").render(**parts, script=Markup(script))
 
