@@ -48,6 +48,7 @@ def listening(port: int | None) -> socket.socket:
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         listener.bind((ADDRESS, port or 0))
+        listener.listen()  # so that whoever is told the address may ask at once
     except OSError as error:
         listener.close()
         why, hint = error.strerror or str(error), "Leave out --port: a free one is found."
@@ -148,11 +149,10 @@ class ViewServer:
         return _packed(content)
 
     def _finish(self, request: Request) -> Response:
-        asked = self.state.finish()
-        return JSONResponse({"asked": asked}, 202 if asked else 409)
+        return JSONResponse({"asked": self.state.finish()})
 
 
 def _packed(content: bytes | None) -> Response:
-    if content is None:
-        return Response("not there any more", 404)
+    if content is None:  # the training has gone on meanwhile, which is no error: browsers would log one
+        return Response(status_code=204)
     return Response(content, media_type="application/octet-stream")

@@ -57,7 +57,7 @@ class Follower {
 
   async fetched(what) {
     const response = await fetch(what);
-    return response.ok ? contentsOf(await response.arrayBuffer()) : null;
+    return response.status === 200 ? contentsOf(await response.arrayBuffer()) : null;
   }
 
   async finish() {
@@ -81,7 +81,7 @@ class Follower {
       train !== undefined && `train ${train.toFixed(1)} dB`,
     ];
     byId("live-figures").textContent = figures.filter(Boolean).join(" · ");
-    byId("live-progress").value = progress ?? 0;
+    byId("live-progress").value = progress ?? (this.shown ? 1 : 0); // between the last step and the finished folder: 1
     byId("finish").hidden = phase !== "training" || step === undefined;
     byId("finish").disabled = Boolean(finishing || this.asked);
     byId("finish").textContent = finishing ? "Finishing …" : this.asked ? "Asked to finish …" : "Finish now";

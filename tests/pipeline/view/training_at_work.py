@@ -2,18 +2,18 @@
 
 import os
 import threading
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from nerf.training.trainer import StepResult
 from pipeline.engine import manifests
 from pipeline.engine.manifests import Manifest
 from pipeline.engine.run_file import RunFile, write
 from pipeline.engine.workspace import Workspace
 from stages import train
-from stages.contract import run_stage
+from stages.contract import StageResult, plan_stage
 from stages.io.files import write_json
-from stages.train.live import ask_to_finish
+from stages.train import training
 from tests.conftest import SilentProgress
 from tests.stages.photo_scene import photographed
 from tests.stages.viewer.made_fields import NAMES
@@ -23,8 +23,15 @@ GRID: dict[str, Any] = {"num_levels": 2, "log2_hashmap_size": 10, "max_res": 32,
 MANY_STEPS = 1_000_000
 
 
-def manifest_of(stage: str, facts: dict[str, Any]) -> Manifest:
-    return Manifest(stage, 1, KEYS[stage], {}, {}, {}, "", {}, facts, "", 1.0, "")
+def manifest_of(stage: str, folder: Path, result: StageResult) -> Manifest:
+    """Of ``result`` in ``folder``."""
+    outputs, records = (manifests.describe_outputs(folder, names) for names in (result.outputs, result.records))
+    digest = manifests.outputs_digest(outputs)
+    return Manifest(stage, 1, KEYS[stage], {}, {}, outputs, digest, records, result.facts, "", 1.0, "")
+
+
+class Over(BaseException):
+    """The test is."""
 
 
 class TrainingAtWork:
@@ -32,7 +39,7 @@ class TrainingAtWork:
 
     def __init__(self, folder: Path, steps: int = MANY_STEPS, field: str = "grid") -> None:
         self.root = folder / "w.nerf"
-        made, self.scene = photographed(folder / "made")
+        made, self.scene = photographed(folder / "made", channels=4)
         content = self.scene.to_json()
         for view, name in zip(content["views"][::2], NAMES, strict=False):
             view["name"] = name
@@ -40,7 +47,7 @@ class TrainingAtWork:
         for name, finished in self.inputs.items():
             finished.parent.mkdir(parents=True)
             made[name].rename(finished) if name in made else finished.mkdir()
-            manifests.write(finished, manifest_of(name, {}))
+            manifests.write(finished, manifest_of(name, finished, StageResult((), "")))
         write_json(self.inputs["normalise"] / "scene.json", content)
         write_json(self.inputs["scale"] / "scale.json", {"metres_per_unit": None})
         write(self.root, RunFile(keys=KEYS))
@@ -49,6 +56,7 @@ class TrainingAtWork:
         self.config = train.Config(downscale=1.0, steps=steps, field=field, checkpoint_seconds=1e3, **sizes)  # pyright: ignore
         self.thread = threading.Thread(target=self._train, daemon=True)
         self.error: BaseException | None = None
+        self.over = False
 
     def __enter__(self) -> "TrainingAtWork":
         self.workspace.__enter__()
@@ -58,10 +66,19 @@ class TrainingAtWork:
 
     def _train(self) -> None:
         try:
-            result = run_stage(train, self.config, self.inputs, self.partial, SilentProgress())
-            manifest = manifest_of("train", result.facts)
-            for names, described in ((result.outputs, manifest.outputs), (result.records, manifest.records)):
-                described.update(manifests.describe_outputs(self.partial, names))
+            config = plan_stage(train, self.config, self.inputs, SilentProgress())
+            loaded = training.load(config, self.inputs, self.partial, SilentProgress())
+            trainer, step = loaded.run.trainer, loaded.run.trainer.step
+
+            def step_unless_over(*words: Any) -> StepResult:
+                if self.over:
+                    raise Over
+                return step(*words)
+
+            trainer.step = step_unless_over
+            training.compute(loaded)
+            result = training.save(loaded, self.partial, SilentProgress())
+            manifest = manifest_of("train", self.partial, result)
             self.workspace.finish(self.partial, self.workspace.folder("train", KEYS["train"]), manifest)
         except BaseException as error:
             self.error = error
@@ -72,10 +89,8 @@ class TrainingAtWork:
         assert not self.thread.is_alive() and self.error is None, self.error
 
     def __exit__(self, *_: object) -> None:
-        while self.thread.is_alive():
-            with suppress(OSError):
-                ask_to_finish(self.partial)
-            self.thread.join(0.2)
+        self.over = True
+        self.thread.join(120)
         self.workspace.__exit__()
 
 

@@ -57,7 +57,6 @@ def test_who_watches_sees_state_and_field(tmp_path: Path, progress) -> None:
     steps = [state["step"] for state in told]
     assert steps == sorted(steps) and len(set(steps)) > 100 and 0 < told[-1]["progress"] < 1
     assert told[-1]["total_steps"] == STEPS and told[-1]["curve"][-1][1] == pytest.approx(20, abs=0.1)
-    assert len({state["field"] for state in told}) == 1, "the next field is seconds away"
     assert not touch(tmp_path) and not ask_to_finish(tmp_path), "a training that has ended is not watched"
 
 
