@@ -34,6 +34,7 @@ from pipeline.engine.failures import StageFailed
 from pipeline.engine.runner import Runner
 from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace
+from pipeline.view import beside, check_installed, open_browser
 from stages.contract import StageError
 from stages.io.amounts import duration
 
@@ -324,8 +325,6 @@ def _watched(root: Path, wanted: bool, display: Display) -> Iterator[None]:
     if not wanted:
         yield
         return
-    from pipeline.view import beside, open_browser
-
     with beside(root) as url:
         display.headline(f"view it: {url}")
         open_browser(url)
@@ -336,8 +335,6 @@ def command_view(words: Sequence[str]) -> int:
     """``pipeline view WORKSPACE``: until Ctrl-C."""
     given = arguments.parse(arguments.ViewArguments, "view", words)
     workspace = Workspace.existing(given.workspace)
-    from pipeline.view import check_installed, open_browser
-
     check_installed()
     from pipeline.view.server import ViewServer
 

@@ -26,7 +26,9 @@ def check_installed() -> None:
         hint = (
             "Install them with `pip install 'pipeline-nerf[view]'`; output/viewer.html of a finished run needs neither."
         )
-        raise StageError("view.not-installed", "cannot serve a page", f"not installed: {', '.join(missing)}", hint)
+        raise StageError(
+            "pipeline.view-not-installed", "cannot serve a page", f"not installed: {', '.join(missing)}", hint
+        )
 
 
 def open_browser(url: str) -> None:
@@ -49,7 +51,7 @@ def beside(root: Path) -> Iterator[str]:
     line = server.stdout.readline()
     if not line:
         hint = "Run without --view; `pipeline view WORKSPACE --debug` says more."
-        raise StageError("view.no-server", "cannot serve a page", "the server ended at once", hint)
+        raise StageError("pipeline.view-ended", "cannot serve a page", "the server ended at once", hint)
     try:
         yield json.loads(line)["url"]
     finally:

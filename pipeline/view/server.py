@@ -26,6 +26,7 @@ from starlette.routing import Route
 
 from pipeline.view.workspace_state import FINISHED, WorkspaceState
 from stages.contract import StageError
+from stages.viewer.page import page
 
 ADDRESS = "127.0.0.1"
 TOKEN_BYTES = 24
@@ -52,7 +53,7 @@ def listening(port: int | None) -> socket.socket:
     except OSError as error:
         listener.close()
         why, hint = error.strerror or str(error), "Leave out --port: a free one is found."
-        raise StageError("view.port", f"cannot serve at port {port}", why, hint) from error
+        raise StageError("pipeline.view-port", f"cannot serve at port {port}", why, hint) from error
     return listener
 
 
@@ -129,8 +130,6 @@ class ViewServer:
 
     def _page(self, request: Request) -> Response:
         """viewer.html where that is finished, else the page that follows the training."""
-        from stages.viewer.page import page
-
         file = self.state.finished_page()
         return Response(page("live") if file is None else file.read_bytes(), media_type="text/html")
 

@@ -16,6 +16,7 @@ from pipeline.engine.workspace import Workspace
 from stages.contract import StageError
 from stages.train.live import LIVE, STATE, ask_to_finish, touch
 from stages.viewer import INPUTS
+from stages.viewer.page import binary
 
 if TYPE_CHECKING:
     from stages.viewer.live import LiveContents
@@ -94,8 +95,6 @@ class WorkspaceState:
 
     def scene(self) -> bytes | None:
         """Cameras, points and what else does not change; None before there is a field."""
-        from stages.viewer.page import binary
-
         with self.lock:
             training = self.training()
             folder = training.field_folder(training.field) if training.field else None
@@ -108,8 +107,6 @@ class WorkspaceState:
 
     def field(self, name: str) -> bytes | None:
         """The field of that name, packed once for all pages; None where it is not the latest any more."""
-        from stages.viewer.page import binary
-
         with self.lock:
             if self.packed[0] == name and name != FINISHED:
                 return self.packed[1]

@@ -5,14 +5,16 @@ import gzip
 import json
 import struct
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from stages.contract import StageResult
 from stages.io.amounts import bytes_in_words
-from stages.viewer.contents import Contents
+
+if TYPE_CHECKING:
+    from stages.viewer.contents import Contents
 
 FILES = Path(__file__).with_name("page")
 SHADERS = ("space", "field", "march", "overlay")
@@ -20,7 +22,7 @@ SCRIPTS = ("geometry", "contents", "graphics", "renderer", "overlay", "navigatio
 ALIGNMENT = 8  # of a section, for typed arrays
 
 
-def save(contents: Contents, folder: Path) -> StageResult:
+def save(contents: "Contents", folder: Path) -> StageResult:
     """Write viewer.html."""
     payload = packed(contents)
     text = page("still" if contents.header["field"] is not None else "not drawn", payload)
@@ -34,12 +36,12 @@ def save(contents: Contents, folder: Path) -> StageResult:
     return StageResult(("viewer.html",), line, facts=facts)
 
 
-def packed(contents: Contents) -> str:
+def packed(contents: "Contents") -> str:
     """:func:`binary` as gzip in base64. Names of photos stand in there alone, so no HTML ever holds them."""
     return base64.b64encode(gzip.compress(binary(contents), 9, mtime=0)).decode("ascii")
 
 
-def binary(contents: Contents) -> bytes:
+def binary(contents: "Contents") -> bytes:
     """The header's length, the header in JSON, the sections at the places that it says, counted from behind the header,
     each as typed arrays want it."""
     places, body = dict[str, tuple[int, int]](), bytearray()

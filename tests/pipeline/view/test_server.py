@@ -189,14 +189,14 @@ def test_no_other_address_of_this_machine_answers(served: Served) -> None:
 
 def test_a_taken_port_is_refused() -> None:
     taken = listening(None)
-    with refused("view.port", taken.getsockname()[1]):
+    with refused("pipeline.view-port", taken.getsockname()[1]):
         listening(taken.getsockname()[1])
     taken.close()
 
 
 def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(view, "find_spec", lambda name: None if name == "uvicorn" else object())
-    with refused("view.not-installed", "uvicorn", "pipeline-nerf[view]"):
+    with refused("pipeline.view-not-installed", "uvicorn", "pipeline-nerf[view]"):
         view.check_installed()
 
 

@@ -5,6 +5,8 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from nerf.training.trainer import StepResult
 from pipeline.engine import manifests
 from pipeline.engine.manifests import Manifest
@@ -70,12 +72,12 @@ class TrainingAtWork:
             loaded = training.load(config, self.inputs, self.partial, SilentProgress())
             trainer, step = loaded.run.trainer, loaded.run.trainer.step
 
-            def step_unless_over(*words: Any) -> StepResult:
+            def step_unless_over(number: int, progress: float, lr_scale: float) -> StepResult:
                 if self.over:
                     raise Over
-                return step(*words)
+                return step(number, progress, lr_scale)
 
-            trainer.step = step_unless_over
+            trainer.step = step_unless_over  # pyright: ignore[reportAttributeAccessIssue]
             training.compute(loaded)
             result = training.save(loaded, self.partial, SilentProgress())
             manifest = manifest_of("train", self.partial, result)
@@ -96,8 +98,6 @@ class TrainingAtWork:
 
 def can_reach_other_address() -> str | None:
     """An address of this machine other than those of the loop; None where there is none."""
-    import psutil
-
     addresses = [each.address for of in psutil.net_if_addrs().values() for each in of if each.family.name == "AF_INET"]
     return next((address for address in addresses if not address.startswith("127.")), None)
 

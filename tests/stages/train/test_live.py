@@ -81,9 +81,11 @@ def test_a_full_disk_ends_no_training(tmp_path: Path) -> None:
 
 
 def test_watching_changes_no_step(tmp_path: Path, progress) -> None:
-    alone, watched = watchable(tmp_path / "a", progress), watchable(tmp_path / "b", progress, lambda *_: None)
+    def watch(step: int, _: float) -> None:
+        touch(tmp_path / "b")
+
+    alone, watched = watchable(tmp_path / "a", progress), watchable(tmp_path / "b", progress, watch)
     alone.train()
-    number_of(watched).trouble = lambda step, _: touch(tmp_path / "b") and None
     watched.train()
     assert torch.equal(number_of(alone).value, number_of(watched).value)
 
