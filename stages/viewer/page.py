@@ -25,7 +25,7 @@ ALIGNMENT = 8  # of a section, for typed arrays
 def save(contents: "Contents", folder: Path) -> StageResult:
     """Write viewer.html."""
     payload = packed(contents)
-    text = page("still" if contents.header["field"] is not None else "not drawn", payload)
+    text = page("not drawn" if contents.loss_db is None else "still", payload)
     (folder / "viewer.html").write_text(text, "utf-8")
     size = (folder / "viewer.html").stat().st_size
     if contents.loss_db is None:
