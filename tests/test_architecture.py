@@ -22,6 +22,7 @@ PIPELINE_ORDER = (
     "doctor",
     "demo",
     "view",
+    "batch",
     "cli",
     "__main__",
 )  # each imports those before it alone
