@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 FILES = Path(__file__).with_name("page")
 SHADERS = ("space", "field", "march", "overlay")
-SCRIPTS = ("geometry", "contents", "graphics", "renderer", "overlay", "navigation", "path", "panels", "live", "main")
+SCRIPTS = ("geometry", "contents", "graphics", "renderer", "overlay", "navigation", "path", "panels", "main")
 ALIGNMENT = 8  # of a section, for typed arrays
 
 
@@ -59,8 +59,9 @@ def page(kind: Literal["still", "not drawn", "live"], payload: str = "") -> str:
         loader=FileSystemLoader(FILES), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
     parts: dict[str, Any] = {"kind": kind, "payload": Markup(payload), "style": Markup(_text("style.css"))}
+    scripts = (*SCRIPTS, "live") if kind == "live" else SCRIPTS
     shaders = json.dumps({name: _text(f"shaders/{name}.glsl") for name in SHADERS})
-    script = "\n".join([f"const SHADERS = {shaders};", *(_text(f"{name}.js") for name in SCRIPTS)])
+    script = "\n".join([f"const SHADERS = {shaders};", *(_text(f"{name}.js") for name in scripts)])
     return environment.get_template("page.html.j2").render(**parts, script=Markup(script))
 
 

@@ -11,7 +11,7 @@ import pytest
 from stages.io.files import write_json, write_tensors
 from stages.mesh.preview import SMALL_COPY
 from tests.stages.report.report_workspace import make_workspace, written
-from tests.stages.viewer.browser import chromium
+from tests.stages.viewer.browser import WAIT_SECONDS, chromium
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +131,7 @@ def test_the_mesh_turns(tmp_path: Path, progress: Any):
         page, faults = browser.new_page(viewport={"width": 500, "height": 700}), []
         page.on("console", lambda message: faults.append(message.text))
         page.on("pageerror", lambda error: faults.append(str(error)))
+        page.set_default_timeout(1000 * WAIT_SECONDS)
         page.goto((tmp_path / "out/report.html").as_uri())
         canvas = page.locator("#turntable")
         canvas.scroll_into_view_if_needed()
@@ -156,6 +157,7 @@ def test_no_screen_is_too_narrow_and_wide_ones_are_used(tmp_path: Path, progress
     written(with_mesh_and_viewer(tmp_path), tmp_path / "out", progress)
     with chromium() as browser:
         page = browser.new_page(viewport={"width": width, "height": 800})
+        page.set_default_timeout(1000 * WAIT_SECONDS)
         page.goto((tmp_path / "out/report.html").as_uri())
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         halves = page.evaluate("[...document.querySelectorAll('.half')].map((e) => e.getBoundingClientRect().left)")

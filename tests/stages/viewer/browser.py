@@ -16,7 +16,7 @@ from nerf.geometry.rays import Rays, rays_of_view
 CHROMIUM = Path("/usr/bin/chromium")
 SOFTWARE_GL = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 STALL = "GPU stall due to ReadPixels"  # a hint of the driver: to wait is what a test wants
-WAIT_SECONDS = 120  # for a page on a busy machine
+WAIT_SECONDS = 300  # for a page on a busy machine
 
 
 @contextmanager
@@ -43,6 +43,7 @@ class Viewer:
         self.page.on("console", lambda message: self._told(message.text))
         self.page.on("pageerror", lambda error: self.faults.append(str(error)))
         self.page.on("request", lambda request: self._requested(request.url))
+        self.page.set_default_timeout(1000 * WAIT_SECONDS)
         self.page.goto(self.own + fragment)
         self.until(
             "window.viewer || window.follower || document.getElementById('message')?.textContent.includes('cannot')"

@@ -90,7 +90,10 @@ def test_16_bits_colours_without_directions_and_effects(browser: Any, tmp_path: 
 def test_the_exposure_slider_makes_a_stop_more_light(browser: Any, tmp_path: Path):
     """Twice the light in linear values, as by nerf/effects/exposure.py; what is clipped aside."""
     effects = {"exposure": gains([f"{index}.png" for index in range(8)])["exposure"]}
-    page = Viewer(browser, written(tmp_path, "contraction", effects=effects)[1])
+    field = made(tmp_path, "contraction", effects=effects)
+    (tmp_path / "viewer").mkdir()
+    run_stage(viewer, viewer.Config(bits="8"), field.inputs, tmp_path / "viewer", SilentProgress())
+    page = Viewer(browser, tmp_path / "viewer/viewer.html", 60, 45)
     before = page.shown().reshape(-1, 4)[:, :3] / 255
     page.run("() => { const e = byId('exposure'); e.value = 1; e.dispatchEvent(new Event('input')); }")
     assert page.run("byId('exposure-value').textContent") == "+1 EV"
