@@ -43,7 +43,7 @@ def run(case: Case, workspace: Path, seconds: float, field: str, seed: int) -> F
     train = stage_folder(workspace, "curve.json")
     facts = read_json(train / "manifest.json")["facts"]
     scene = read_scene(stage_folder(workspace, "scene.json"))
-    made = provenance()
+    made, (width, height) = provenance(), metrics["scored_size"]
     return {
         "table": case.table,
         "scene": case.scene,
@@ -54,7 +54,7 @@ def run(case: Case, workspace: Path, seconds: float, field: str, seed: int) -> F
         "lpips": mean_lpips(folder, stage_folder(workspace, "photos.json"), scene, load_lpips()),
         "steps": facts["steps"],
         "trained_size": "{} × {}".format(*metrics["trained_size"]),
-        "deviates": "; ".join(deviations(case, scene, tuple(metrics["scored_size"]))) or None,
+        "deviates": "; ".join(deviations(case, scene, (width, height))) or None,
         **{name: made[name] for name in ("machine", "commit")},
         "date": str(date.today()),
     }

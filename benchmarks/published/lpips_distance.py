@@ -2,10 +2,12 @@
 
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
 import torch
+from PIL import Image
 from torch import Tensor
 
 from nerf.geometry.scene import Scene
@@ -22,9 +24,7 @@ def load_lpips() -> Distance | None:
     if find_spec("lpips") is None or not weights.is_file():
         print(f"LPIPS is not computed: {missing}", file=sys.stderr)
         return None
-    from lpips import LPIPS
-
-    return LPIPS(net="vgg", verbose=False)
+    return import_module("lpips").LPIPS(net="vgg", verbose=False)
 
 
 def mean_lpips(evaluate: Path, ingest: Path, scene: Scene, distance: Distance | None) -> float | None:
@@ -44,8 +44,6 @@ def mean_lpips(evaluate: Path, ingest: Path, scene: Scene, distance: Distance | 
 
 def _picture(file: Path) -> Tensor:
     """(1, 3, height, width) in [0, 1]."""
-    from PIL import Image
-
     with Image.open(file) as opened:
         width, height = opened.size
     pixels = torch.from_numpy(load_pixels(file, width, height).copy()).permute(2, 0, 1)[None].float() / 255

@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from PIL import Image
+
 from nerf.geometry.scene import Scene
 
 BLENDER_SIZE, LLFF_SIZE = (800, 800), (1008, 756)
@@ -64,8 +66,6 @@ def find_case(table: str, folder: Path) -> Case:
 
 def _longer_side(photos: Path) -> int:
     """Of the first photo of a folder, pixels."""
-    from PIL import Image
-
     for file in sorted(photos.iterdir()):
         if file.suffix.lower() in (".jpg", ".jpeg", ".png"):
             with Image.open(file) as photo:

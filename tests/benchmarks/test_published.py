@@ -25,7 +25,7 @@ def photo(file: Path, size: tuple[int, int], colour: tuple[int, ...] = (9, 9, 9)
 
 
 def scene_of(train: int, test: int, size: tuple[int, int] = (8, 8)) -> Scene:
-    splits: list[Split] = [*["train"] * train, *["test"] * test]
+    splits: list[Split] = ["train" if index < train else "test" for index in range(train + test)]
     views = [View(str(i), f"images/{i}.png", 0, np.eye(4)[:3], 1.0, 2.0, split) for i, split in enumerate(splits)]
     camera = Camera("PINHOLE", *size, (9.0, 9.0, size[0] / 2, size[1] / 2))
     return Scene((camera,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), True, False, "object-centric", True)
