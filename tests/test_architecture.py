@@ -16,7 +16,15 @@ from stages.contract import StageConfig
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("nerf", "stages", "pipeline")
 MAY_IMPORT = {"nerf": {"nerf"}, "stages": {"nerf", "stages"}, "pipeline": {"nerf", "stages", "pipeline"}}
-PIPELINE_ORDER = ("schedule", "engine", "doctor", "demo", "cli", "__main__")  # each imports those before it alone
+PIPELINE_ORDER = (
+    "schedule",
+    "engine",
+    "doctor",
+    "demo",
+    "batch",
+    "cli",
+    "__main__",
+)  # each imports those before it alone
 NERF_MAY_USE = {"torch", "numpy", "jaxtyping"}
 DISK = {"pathlib", "os", "io", "shutil", "tempfile"}
 KERNELS = "nerf/kernels/warp/"  # alone may use Warp, whose kernels name all their arrays

@@ -90,6 +90,31 @@ class RunArguments:
 
 
 @dataclass
+class BatchArguments:
+    """Run every folder of photos and every video in a folder, one after another, and rank the results on one page."""
+
+    scenes: tyro.conf.Positional[Path]
+    """The folder of scenes."""
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
+    common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
+    output: Annotated[Auto[Path], tyro.conf.arg(aliases=["-o"])] = None
+    """The folder for the workspaces and the page (default: <scenes>.batch in the current folder)."""
+    effect: Effects = ()
+    budget: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="DURATION",
+            help="Wall time for all scenes together: 30m, 2h (default: no limit).",
+            help_behavior_hint="",
+        ),
+    ] = None
+    until: Auto[str] = None
+    """Stop each run after this stage (default: run all)."""
+    config: Auto[Path] = None
+    """A TOML file with a table of options per stage. Flags override it."""
+
+
+@dataclass
 class StageArguments:
     """Bring one stage of a workspace up to date, with the recorded options and the given flags."""
 
@@ -169,6 +194,7 @@ class DemoArguments:
 
 COMMANDS: dict[str, type] = {
     "run": RunArguments,
+    "batch": BatchArguments,
     "resume": ResumeArguments,
     "status": StatusArguments,
     "explain": ExplainArguments,
@@ -214,7 +240,9 @@ def parse(kind: type[T], command: str, words: Sequence[str]) -> T:
 
     Raises UsageError with every wrong word in a sentence of its own, SystemExit(0) after ``--help``.
     """
-    positional = {name: tyro.MISSING for name in ("photos", "workspace", "stage") if name in kind.__annotations__}
+    positional = {
+        name: tyro.MISSING for name in ("photos", "scenes", "workspace", "stage") if name in kind.__annotations__
+    }
     default: Any = kind(**positional)
     said = io.StringIO()
     try:

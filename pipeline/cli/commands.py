@@ -113,6 +113,7 @@ def _say(code: str, what: str, why: str, hint: str, as_json: bool) -> None:
 def _command(name: str) -> Callable[[Sequence[str]], int]:
     commands: dict[str, Callable[[Sequence[str]], int]] = {
         "run": command_run,
+        "batch": command_batch,
         "resume": command_resume,
         "status": command_status,
         "explain": command_explain,
@@ -166,6 +167,39 @@ def command_run(words: Sequence[str]) -> int:
             return exit_codes.of_stage(stage_list.SOURCE)
         new_budget = None if given.more is not None else (budget, 0.0)
         return _run_stages(root, asked, stages, given.common, display, force, new_budget=new_budget)
+
+
+def command_batch(words: Sequence[str]) -> int:
+    """``pipeline batch SCENES``: a run for each scene in a folder."""
+    if words and words[0].startswith("-") and not {"-h", "--help"} & {*words}:
+        raise UsageError(f"give the folder of scenes first: pipeline batch SCENES {' '.join(words[:2])} …")
+    given = arguments.parse(arguments.BatchArguments, "batch", words)
+    settings = given.settings
+    if given.config is not None:
+        file = settings_from(read_toml(given.config), f"--config {given.config}")
+        settings = arguments.with_flags(file, settings, "batch", words)
+    settings = with_effects(settings, given.effect)
+    budget = _budget(given.budget, settings)
+    _known_stage(given.until or list(stage_list.STAGES)[-1], "--until")
+    from pipeline.batch import Batch, run_batch
+    from pipeline.batch.scenes import find_scenes
+
+    folder = given.output or Path.cwd() / f"{given.scenes.absolute().name}.batch"
+    batch = Batch(find_scenes(given.scenes), folder, _words_of_each(words[1:]), budget)
+    with choose_display(given.common.json) as display:
+        return exit_codes.BATCH if run_batch(batch, display) else 0
+
+
+def _words_of_each(words: Sequence[str]) -> list[str]:
+    """The words of a batch's command line that each of its runs is given: not those that are the batch's own."""
+    own, each = ("-o", "--output", "--budget"), list[str]()
+    rest = iter(words)
+    for word in rest:
+        if word in own:
+            next(rest, None)
+        elif word != "--json" and word.partition("=")[0] not in own:
+            each.append(word)
+    return each
 
 
 def _keeping_studies(settings: Settings, root: Path, words: Sequence[str], file: Collection[str] = ()) -> Settings:

@@ -30,6 +30,8 @@ def go_on(words: Sequence[str]) -> str:
     way = "the same command continues"
     if words[0] in ("run", "resume"):  # what was asked for is recorded before any stage begins
         way = "`pipeline resume WORKSPACE` continues"
+    elif words[0] == "batch":
+        way = "the same command continues with the scene that was stopped"
     elif "--force" in words:
         way = "the same command starts over"
     elif "--replan" in words:

@@ -12,6 +12,7 @@ as one photo.
 All arrays are numpy float64. A *match* is directed here: every undirected one counts once each way.
 """
 
+from collections.abc import Container
 from typing import NamedTuple
 
 import numpy as np
@@ -262,6 +263,19 @@ def consistent_matches(
     return np.where(trusted[matches.pair], ~off, agrees & enough[matches.pair])
 
 
+def supported_pairs(
+    matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"], trusted: Bool[np.ndarray, "pairs"]
+) -> Bool[np.ndarray, "pairs"]:
+    """The ``trusted`` pairs whose matches, all together, agree with the poses, by the depths that trusted pairs alone
+    give.
+
+    Stricter than :func:`check_poses`, which believes a pair that neither agrees nor contradicts: where a sequence hangs
+    by one pair from photo to photo, that pair has to agree."""
+    error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, trusted))
+    _, tolerance = _tolerance_px(error[trusted], matches.weight[trusted])
+    return trusted & (error <= tolerance)
+
+
 def _photo_medians(
     matches: PairMatches, error_px: Float[np.ndarray, "pairs"], count: int
 ) -> Float[np.ndarray, "photos"]:
@@ -301,14 +315,19 @@ def weak_links(matches: PairMatches, check: PoseCheck) -> list[WeakLink]:
 
 
 def outside_main_segment(
-    sequence: Int[np.ndarray, "photos"], matches: PairMatches, check: PoseCheck, reach: int
+    sequence: Int[np.ndarray, "photos"],
+    matches: PairMatches,
+    check: PoseCheck,
+    reach: int,
+    supported: Container[tuple[int, int]] | None = None,
 ) -> Bool[np.ndarray, "photos"]:
     """Photos that passed and are outside the longest segment of the capture ``sequence``, where the poses break it.
 
     Where a scene has repeated structure, photos of one part can be registered in another: they agree there with what
     they see and outvote those between the parts, which are right. Such a break is where matches lead along the sequence
     through photos that failed, and no photo up to ``reach`` positions before them agrees with one behind: only the
-    longest segment can be relied on. Where :func:`is_fragmented` holds, every broken step separates segments.
+    longest segment can be relied on. Where :func:`is_fragmented` holds, every broken step separates segments; where
+    ``supported`` steps (photos in order of the sequence) are given, every other step does.
     """
     count = len(check.misplaced)
     verified, agrees = (
@@ -327,6 +346,8 @@ def outside_main_segment(
         )
         leads_through = after > before + 1 and linked[before + 1 : after + 1].all()
         broken = (leads_through and not agrees[crossing].any()) or (fragmented and breaks[number - 1])
+        step = (int(sequence[before]), int(sequence[after]))
+        broken = broken or (supported is not None and step not in supported)
         segment[number] = segment[number - 1] + broken
     outside = np.zeros(count, bool)
     if len(positions):

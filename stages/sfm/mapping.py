@@ -1,7 +1,7 @@
 """From matches to a model whose poses pass the check, compared with global mapping. Runs in the worker process."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,8 +21,10 @@ from stages.sfm.colmap.repair import (
     deregister,
     drop_outside_main_segment,
     fragments_sequence,
+    longest_supported,
     reasons,
     register_again,
+    supported_steps,
 )
 from stages.sfm.colmap.thinning import thin_matches
 from stages.sfm.job import JobState
@@ -71,10 +73,13 @@ def run_mapping(
     other = load_native(beside.folder) if beside and not failure else None
     compared = None if beside is None else {"failed": failure}
     if found:
+        trusted = consecutive_pairs(state) if strategy.matches == "consecutive" else set[tuple[int, int]]()
+        if trusted:
+            found.sort(key=lambda model: longest_supported(model, state.database, trusted), reverse=True)
         before = found[0]
-        if strategy.matches == "consecutive":
-            copy_consistent_matches(before, state.database, database, consecutive_pairs(state))
-        checked = _checked(before, other, database, matches, options, state)
+        if trusted:
+            copy_consistent_matches(before, state.database, database, trusted)
+        checked = _checked(before, other, database, matches, options, state, trusted)
         found[0] = checked.model
         if other is not None:  # where it was taken itself, it is compared with the one that it replaced
             rejected = before if found[0] is other else other
@@ -105,9 +110,18 @@ def _start_global_mapping(strategy: Strategy, database: Path, state: JobState) -
     return global_mapping.start(database, state.sibling("global"), state.images, folder, state.job.seed, known)
 
 
-def _checked(model: Any, other: Any, database: Path, matches: Path, options: Any, state: JobState) -> CheckedModel:
+def _checked(
+    model: Any,
+    other: Any,
+    database: Path,
+    matches: Path,
+    options: Any,
+    state: JobState,
+    trusted: Collection[tuple[int, int]],
+) -> CheckedModel:
     """The model without the images that fail the check. These are registered again first, in the model of global
-    mapping where that fits the verified matches better."""
+    mapping where that fits the verified matches better. Of a model that hangs by ``trusted`` pairs from photo to photo
+    each of these has to agree."""
     best, sequence = (model, check_model(model, database, state.job.seed)), capture_sequence(database, state)
     checks = [best]
     if not fragments_sequence(best[1], sequence):
@@ -136,7 +150,8 @@ def _checked(model: Any, other: Any, database: Path, matches: Path, options: Any
     model, checked = best
     why = reasons(model, checked)
     deregister(model, checked.failed())
-    outside = drop_outside_main_segment(model, checked, sequence)
+    supported = supported_steps(model, state.database, trusted) if trusted else None
+    outside = drop_outside_main_segment(model, checked, sequence, supported)
     excluded = why | outside
     return CheckedModel(
         model, excluded, bool(outside), checked.fits, [one for one in checks if not (excluded and one is best)]

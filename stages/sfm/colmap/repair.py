@@ -5,6 +5,7 @@ Call it in a worker process. stages/sfm/geometry_check.py decides what contradic
 
 import shutil
 from collections.abc import Container, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,9 +26,10 @@ from stages.sfm.geometry_check import (
     is_fragmented,
     outside_main_segment,
     sequence_breaks,
+    supported_pairs,
     weak_links,
 )
-from stages.sfm.pairs.match_graph import ORDER_OVERLAP
+from stages.sfm.pairs.match_graph import ORDER_OVERLAP, connected
 
 
 class Checked(NamedTuple):
@@ -137,14 +139,46 @@ def copy_consistent_matches(
     finish_copy(unfinished, copy)
 
 
+def supported_steps(
+    model: pycolmap.Reconstruction, database: Path, trusted: Container[tuple[int, int]]
+) -> set[tuple[int, int]]:
+    """The ``trusted`` pairs (image ids, the lower first) of registered images whose verified matches agree with their
+    poses: all those of a ``database`` before :func:`copy_consistent_matches`, which leaves only those that do."""
+    with pycolmap.Database.open(database) as db:
+        ids, matches = read_pair_matches(db, model, 0, most=None)
+    pairs = np.array(ids)[matches.pairs].tolist()
+    steps = np.array([(i, j) in trusted for i, j in pairs], bool)
+    supported = supported_pairs(matches, camera_poses(model), steps)
+    return {(i, j) for (i, j), agrees in zip(pairs, supported, strict=True) if agrees}
+
+
+def longest_supported(model: pycolmap.Reconstruction, database: Path, trusted: Container[tuple[int, int]]) -> int:
+    """How many images hang together by :func:`supported_steps`, at most."""
+    ids = sorted(model.reg_image_ids())
+    steps = np.searchsorted(ids, np.array([*supported_steps(model, database, trusted)], int).reshape(-1, 2))
+    linked = np.zeros((len(ids), len(ids)), bool)
+    linked[steps[:, 0], steps[:, 1]] = True
+    return int(np.bincount(connected(linked)).max(initial=0))
+
+
 def drop_outside_main_segment(
-    model: pycolmap.Reconstruction, checked: Checked, sequence: Sequence[int]
+    model: pycolmap.Reconstruction,
+    checked: Checked,
+    sequence: Sequence[int],
+    supported: Container[tuple[int, int]] | None = None,
 ) -> dict[str, str]:
     """Deregister images outside the longest segment of a broken capture ``sequence`` (image ids, none where it is not
-    known): by name why."""
-    fragmented = fragments_sequence(checked, sequence)
-    neighbours = "photos taken just before or after" if fragmented else "photos taken between it and the others"
-    outside = outside_main_segment(_numbers(checked, sequence), checked.matches, checked.check, ORDER_OVERLAP)
+    known): by name why. Every step but the ``supported`` ones (image ids, the lower first) breaks it, where these are
+    given."""
+    just_beside = supported is not None or fragments_sequence(checked, sequence)
+    neighbours = "photos taken just before or after" if just_beside else "photos taken between it and the others"
+    numbers = _numbers(checked, sequence)
+    holding = supported and {
+        (first, second)
+        for first, second in pairwise(numbers.tolist())
+        if (min(ids := (checked.ids[first], checked.ids[second])), max(ids)) in supported
+    }
+    outside = outside_main_segment(numbers, checked.matches, checked.check, ORDER_OVERLAP, holding)
     ids = [image_id for image_id, is_outside in zip(checked.ids, outside, strict=True) if is_outside]
     deregister(model, ids)
     why = f"{neighbours} contradict its pose: repeated structure"

@@ -30,7 +30,7 @@ def test_no_words_is_a_usage_error():
 
 def test_an_unknown_command_lists_the_known_ones(capsys: pytest.CaptureFixture[str]):
     assert run_command(["fly"]) == 2
-    assert "no command 'fly'; there are: run, resume," in capsys.readouterr().err
+    assert "no command 'fly'; there are: run, batch, resume," in capsys.readouterr().err
 
 
 def test_help_of_run_lists_the_stage_options(capsys: pytest.CaptureFixture[str]):

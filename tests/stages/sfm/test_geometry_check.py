@@ -13,6 +13,7 @@ from stages.sfm.geometry_check import (
     outside_main_segment,
     pair_medians,
     sequence_breaks,
+    supported_pairs,
     transfer_errors_px,
     weak_links,
 )
@@ -231,6 +232,20 @@ def test_of_a_fragmented_sequence_only_the_longest_segment_stays(
     trusting = check_poses(matches, poses)._replace(misplaced=np.zeros(30, bool), unlinked=np.zeros(30, bool))
     assert sequence_breaks(sequence, matches, trusting) == [tuple(step) for step in breaks]
     assert np.flatnonzero(outside_main_segment(sequence, matches, trusting, 5)).tolist() == lost
+
+
+def test_a_step_that_holds_a_sequence_has_to_agree() -> None:
+    matches, poses = walk()
+    steps = matches.pairs[:, 1] == matches.pairs[:, 0] + 1
+    assert supported_pairs(matches, poses, steps)[steps].all()
+    bent = moved(poses, list(range(12, 30)), 0.2)
+    check = check_poses(matches, bent)._replace(misplaced=np.zeros(30, bool), unlinked=np.zeros(30, bool))
+    unsupported = steps & ~supported_pairs(matches, bent, steps)
+    assert matches.pairs[unsupported].tolist() == [[11, 12]]
+    assert not check.contradicts[unsupported].any(), "the check alone leaves it in doubt"
+    assert not outside_main_segment(np.arange(30), matches, check, 5).any()
+    supported = {(i, i + 1) for i in range(29) if i != 11}
+    assert np.flatnonzero(outside_main_segment(np.arange(30), matches, check, 5, supported)).tolist() == [*range(12)]
 
 
 def restricted(matches: PairMatches, kept: np.ndarray) -> PairMatches:

@@ -22,9 +22,12 @@ from stages.sfm.colmap.repair import (
     check_model,
     copy_consistent_matches,
     deregister,
+    drop_outside_main_segment,
     facts,
+    longest_supported,
     reasons,
     register_again,
+    supported_steps,
 )
 from stages.sfm.colmap.thinning import thin_matches
 from stages.sfm.matching import consecutive_pairs
@@ -230,6 +233,20 @@ def test_matches_consistent_with_trusted_pairs_are_kept(made: Made, tmp_path: Pa
     assert verified_pairs(copy) == {pair for pair in combinations(range(1, PHOTOS + 1), 2) if 5 not in pair}
     copy_consistent_matches(wrong, made.database, copy, steps)  # trusted matches stay unless they are clearly off
     assert verified_pairs(copy) & {(4, 5), (5, 6)} == set()
+
+
+def test_steps_are_judged_by_all_their_matches(made: Made, tmp_path: Path) -> None:
+    wrong, steps = turned_alone(made, 5), {(i, i + 1) for i in range(1, PHOTOS)}
+    copy = tmp_path / "consecutive.db"
+    copy_consistent_matches(wrong, made.database, copy, steps)
+    supported = supported_steps(wrong, made.database, steps)
+    assert steps - supported == {(3, 4), (4, 5), (5, 6), (6, 7)}, "depths are in doubt a step farther"
+    assert longest_supported(wrong, made.database, steps) == PHOTOS - 6
+    assert longest_supported(made.model, made.database, steps) == PHOTOS
+    checked = check_model(wrong, copy, 0)
+    outside = drop_outside_main_segment(wrong, checked, [*range(1, PHOTOS + 1)], supported)
+    failed = {wrong.image(image_id).name for image_id in checked.failed()}
+    assert outside.keys() | failed == {wrong.image(image_id).name for image_id in range(1, 7)}
 
 
 def turned_alone(made: Made, image_id: int) -> Any:

@@ -1,0 +1,85 @@
+"""batch.json: what a batch was asked for and how each of its scenes stands."""
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from stages.contract import StageError
+from stages.io.files import first_fault, write_durably
+
+NAME = "batch.json"
+VERSION = 1
+
+
+class SceneFailure(BaseModel):
+    """Why a scene ended without a result: the error of its run, and the stage it came from (None: from none)."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    stage: str | None
+    code: str
+    what: str
+    why: str
+    hint: str
+
+
+class SceneState(BaseModel):
+    """How one scene stands. ``share`` of the batch's budget and ``spent`` by all its runs are seconds; ``line`` tells
+    the result in short; ``figures`` are those of its summary.json that rank it."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    photos: str
+    state: Literal["waiting", "running", "done", "failed"] = "waiting"
+    share: float | None = None
+    spent: float = 0.0
+    line: str = ""
+    figures: dict[str, float | int | bool | str | None] = {}
+    failure: SceneFailure | None = None
+
+
+class BatchFile(BaseModel):
+    """``words``: the options that every run is given; ``budget``: seconds for all of them, None without a limit."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    version: int = VERSION
+    words: list[str] = []
+    budget: float | None = None
+    scenes: dict[str, SceneState] = {}
+
+    def share(self, name: str) -> float | None:
+        """Seconds of the budget for a scene; None without one.
+
+        Scenes that wait share what the others leave. A scene that was interrupted or is done keeps its share, for
+        another one would choose other settings; one that failed before is given an even part of the whole."""
+        scene = self.scenes[name]
+        if self.budget is None or scene.share is not None:
+            return scene.share
+        if scene.spent:
+            return self.budget / len(self.scenes)
+        others = self.scenes.values()
+        used = sum(max(s.share or 0.0, s.spent) if s.state == "running" else s.spent for s in others)
+        waiting = sum(s.share is None and not s.spent for s in others)
+        return max(1.0, (self.budget - used) / waiting)
+
+
+def read(folder: Path) -> BatchFile:
+    """batch.json of a batch's folder; an empty one where there is none. Raises StageError where it cannot be used."""
+    path = folder / NAME
+    try:
+        return BatchFile.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        return BatchFile()
+    except ValidationError as error:
+        why = first_fault(error)
+    except OSError as error:
+        why = (error.strerror or str(error)).lower()
+    hint = f"Delete it and give the same command: finished scenes are kept. {path}"
+    raise StageError("pipeline.batch-file", f"cannot read {path}", why, hint)
+
+
+def write(folder: Path, batch: BatchFile) -> None:
+    """Write batch.json durably. Raises OSError."""
+    write_durably(folder / NAME, (batch.model_dump_json(indent=1) + "\n").encode())

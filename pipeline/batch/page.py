@@ -1,0 +1,63 @@
+"""index.html of a batch: its scenes ranked by PSNR, each with a picture, and what failed with the reason."""
+
+import base64
+import io
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from PIL import Image
+
+from pipeline.batch.batch_file import BatchFile, SceneState
+from stages.io.amounts import duration
+from stages.io.files import write_durably
+
+PAGE = "index.html"
+PICTURE_PX = 360
+LINKED = {"viewer.html": "viewer", "report.html": "report", "mesh.glb": "mesh", "video.mp4": "video"}
+
+
+def write_page(folder: Path, batch: BatchFile) -> None:
+    """Write the page of the batch in ``folder``, whose workspaces lie beside it. Raises OSError."""
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["duration"] = duration
+    scenes = list(batch.scenes.items())
+    done = [(name, scene) for name, scene in scenes if scene.state == "done"]
+    page = environment.get_template("batch.html.j2").render(
+        budget=batch.budget,
+        count=len(scenes),
+        spent=sum(scene.spent for _, scene in scenes),
+        ranked=[_entry(folder, name, scene) for name, scene in sorted(done, key=lambda pair: -_rank(pair[1]))],
+        failed=[(name, scene, quote(f"{name}.log")) for name, scene in scenes if scene.state == "failed"],
+        waiting=[(name, scene.state) for name, scene in scenes if scene.state in ("waiting", "running")],
+    )
+    write_durably(folder / PAGE, page.encode())
+
+
+def _rank(scene: SceneState) -> float:
+    psnr = scene.figures.get("psnr")
+    return float("-inf") if psnr is None else float(psnr)
+
+
+def _entry(folder: Path, name: str, scene: SceneState) -> dict[str, Any]:
+    output = folder / f"{name}.nerf" / "output"
+    found = {words: quote(f"{name}.nerf/output/{file}") for file, words in LINKED.items() if (output / file).exists()}
+    return {"name": name, "scene": scene, "links": found, "picture": _picture(output / "renders")}
+
+
+def _picture(renders: Path) -> str | None:
+    """A small render of a test photo as a data URI; None where there is none."""
+    for file in sorted(renders.glob("*.png"))[:1]:
+        with Image.open(file) as image:
+            image.thumbnail((PICTURE_PX, PICTURE_PX))
+            small = io.BytesIO()
+            image.convert("RGB").save(small, "JPEG", quality=85)
+        return f"data:image/jpeg;base64,{base64.b64encode(small.getvalue()).decode()}"
+    return None

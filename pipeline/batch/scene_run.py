@@ -1,0 +1,100 @@
+"""One scene: `pipeline run` in a process of its own, so that whatever happens there ends that scene alone."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from pipeline.batch.batch_file import SceneFailure
+
+COMMAND = ["-P", "-m", "pipeline.cli.attended", "run"]  # -P: nothing in the current folder is taken for a module
+FIGURES = ("photos", "registered", "psnr", "ssim", "cameras_doubtful", "verdict")
+
+
+def run_scene(
+    words: Sequence[str], log: Path, follow: Callable[[str, float | None], None]
+) -> tuple[str, SceneFailure | None]:
+    """Run `pipeline run` with ``words``; the last line of its output, and why it failed (None: it did not).
+
+    What it says goes to ``log``; ``follow`` gets its live line and the finished share of the stage. Where this process
+    is interrupted, the run is, too, and has ended when the exception goes on."""
+    last, failure = "", None
+    with log.open("a", encoding="utf-8") as text, _started(words, text) as child:
+        assert child.stdout
+        for event in map(json.loads, child.stdout):
+            if event["event"] == "progress":
+                follow(f"{event['stage']} · {event['message']}", event["done"])
+                continue
+            if event["event"] == "begin":
+                follow(event["stage"], None)
+            elif event["event"] == "end":
+                last = f"{event['stage']}: {event['line']}"
+            elif event["event"] == "error":
+                failure = SceneFailure(**{key: event[key] for key in SceneFailure.model_fields})
+            text.write(_in_words(event))
+            text.flush()
+    if child.returncode and failure is None:
+        failure = _crash(log, child.returncode)
+    return last, failure
+
+
+@contextmanager
+def _started(words: Sequence[str], log: IO[str]) -> Iterator["subprocess.Popen[str]"]:
+    path = os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))))
+    child = subprocess.Popen(
+        [sys.executable, *COMMAND, *words, "--json"],
+        stdin=subprocess.PIPE,  # open as long as this process lives
+        stdout=subprocess.PIPE,
+        stderr=log,
+        env={**os.environ, "PYTHONPATH": path},
+        encoding="utf-8",
+        start_new_session=True,  # Ctrl-C reaches this process alone, which hands it on
+    )
+    try:
+        yield child
+    except BaseException:
+        child.send_signal(signal.SIGTERM)
+        raise
+    finally:
+        child.wait()
+        for stream in (child.stdin, child.stdout):
+            if stream:
+                stream.close()
+
+
+def _in_words(event: Mapping[str, Any]) -> str:
+    kind = event["event"]
+    if kind == "begin":
+        return f"{time.strftime('%H:%M:%S')} {event['stage']}\n"
+    if kind == "error":
+        return f"failed: {event['what']}\n  why: {event['why']}\n  try: {event['hint']}\n"
+    words = event.get("line") or event.get("message") or event.get("text") or ""
+    return f"         {words}\n"
+
+
+def _crash(log: Path, ending: int) -> SceneFailure:
+    lines = log.read_text("utf-8", "replace").strip().splitlines()
+    what = (
+        f"its process was ended by {signal.Signals(-ending).name}"
+        if ending < 0
+        else f"its process ended with code {ending}"
+    )
+    memory = ending == -getattr(signal, "SIGKILL", 9)
+    why = "most likely memory ran out" if memory else f"its last words: {lines[-1].strip() if lines else 'none'}"
+    hint = f"Give the same command again: what is finished is kept. Log: {log}"
+    return SceneFailure(stage=None, code="pipeline.scene-crashed", what=what, why=why, hint=hint)
+
+
+def figures_of(workspace: Path) -> dict[str, Any]:
+    """What the summary of a finished run says that ranks it; empty where it made none."""
+    try:
+        summary = json.loads((workspace / "output" / "summary.json").read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return {key: summary.get(key) for key in FIGURES}

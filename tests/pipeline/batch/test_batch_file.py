@@ -1,0 +1,59 @@
+"""How a budget is shared out among scenes, and what is kept of them."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.batch import batch_file
+from pipeline.batch.batch_file import BatchFile, SceneState
+from tests.refusals import refused
+
+
+def batch(**scenes: SceneState) -> BatchFile:
+    return BatchFile(budget=90, scenes=scenes)
+
+
+def waiting(spent: float = 0) -> SceneState:
+    return SceneState(photos="p", spent=spent)
+
+
+def done(spent: float) -> SceneState:
+    return SceneState(photos="p", state="done", share=30, spent=spent)
+
+
+def test_scenes_that_wait_share_what_the_others_leave():
+    assert batch(a=waiting(), b=waiting(), c=waiting()).share("a") == pytest.approx(30)
+    assert batch(a=done(10), b=waiting(), c=waiting()).share("b") == pytest.approx(40)
+    assert batch(a=done(50), b=waiting(), c=waiting()).share("b") == pytest.approx(20)
+
+
+def test_a_budget_that_is_spent_leaves_a_second():
+    assert batch(a=done(200), b=waiting()).share("b") == pytest.approx(1)
+
+
+def test_an_interrupted_scene_keeps_its_share():
+    stopped = SceneState(photos="p", state="running", share=30, spent=12)
+    assert batch(a=stopped, b=waiting(), c=waiting()).share("a") == pytest.approx(30)
+    assert batch(a=stopped, b=waiting(), c=waiting()).share("b") == pytest.approx(30)
+
+
+def test_a_scene_that_failed_before_gets_an_even_part():
+    assert batch(a=done(40), b=waiting(spent=5), c=done(45)).share("b") == pytest.approx(30)
+
+
+def test_without_a_budget_there_is_no_share():
+    assert BatchFile(scenes={"a": waiting()}).share("a") is None
+
+
+def test_what_is_written_is_read(tmp_path: Path):
+    known = batch(a=done(1), b=waiting())
+    batch_file.write(tmp_path, known)
+    assert batch_file.read(tmp_path) == known
+    assert batch_file.read(tmp_path / "new") == BatchFile()
+
+
+@pytest.mark.parametrize("content", ["", "{", '{"version": 1, "more": 2}', '{"scenes": {"a": {}}}'])
+def test_a_damaged_file_is_refused(tmp_path: Path, content: str):
+    (tmp_path / batch_file.NAME).write_text(content)
+    with refused("pipeline.batch-file", tmp_path / batch_file.NAME):
+        batch_file.read(tmp_path)
