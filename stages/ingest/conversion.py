@@ -112,7 +112,7 @@ def convert(source: Source, max_frames: int, folder: Path, progress: Progress) -
     waiting.mkdir(exist_ok=True)
     taken, rejected, notes = _take_all(source, max_frames, waiting, progress)
     if source.kind == "photos":
-        kinds = {photo.name: photo.stored for photo in taken}
+        kinds: dict[str, Stored] = {photo.name: photo.stored for photo in taken}
         deep, masks = depth_maps(kinds), masks_by_values(kinds)
         taken = [photo for photo in taken if photo.name not in deep | masks]
         notes += messages.excluded_by_values(sorted(deep)) + messages.excluded_masks(sorted(masks))
