@@ -18,9 +18,9 @@ from nerf.geometry.scene import Scene
 
 BLENDER_SIZE, LLFF_SIZE = (800, 800), (1008, 756)
 BLENDER_PHOTOS = {"train": 100, "test": 200}
-BLENDER = dict.fromkeys(("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship"), 1)
-LLFF = dict.fromkeys(("fern", "flower", "fortress", "horns", "leaves", "orchids", "room", "trex"), 4)
-INDOOR, OUTDOOR = ("bonsai", "counter", "kitchen", "room"), ("bicycle", "flowers", "garden", "stump", "treehill")
+BLENDER = dict.fromkeys("chair drums ficus hotdog lego materials mic ship".split(), 1)
+LLFF = dict.fromkeys("fern flower fortress horns leaves orchids room trex".split(), 4)
+INDOOR, OUTDOOR = "bonsai counter kitchen room".split(), "bicycle flowers garden stump treehill".split()
 SCENES: Mapping[str, Mapping[str, int]] = {
     "blender": BLENDER,
     "llff": LLFF,
