@@ -59,9 +59,9 @@ class LiveFolder:
         return now < self.watched_until
 
     def show(self, state: dict[str, Any]) -> None:
-        """Write ``state`` with the name of the latest field, and that field if it is due. A disk that is full ends no
-        training here: those say it whose files matter."""
-        with suppress(OSError):
+        """Write ``state`` with the name of the latest field, and that field if it is due. Nothing here ends a training:
+        a full disk is said by those whose files matter, a figure that is not finite by the loop."""
+        with suppress(OSError, ValueError):
             if time.monotonic() >= self.next_snapshot:
                 self._save_field()
             temporary = self.root / f"{STATE}.tmp"

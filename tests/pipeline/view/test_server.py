@@ -229,25 +229,26 @@ def test_without_a_training_it_says_so(tmp_path: Path) -> None:
     server.close()
 
 
-def test_ctrl_c_ends_the_command_and_leaves_the_training_alone(at_work: TrainingAtWork) -> None:
-    words = [sys.executable, "-m", "pipeline", "view", str(at_work.root), "--json"]
-    command = subprocess.Popen(
-        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=quiet_environment()
-    )
-    assert command.stdout is not None
-    port = int(re.findall(r":(\d+)/", json.loads(command.stdout.readline())["url"])[0])
-    ends = time.monotonic() + WAIT_SECONDS
-    while True:  # it answers
-        try:
-            socket.create_connection(("127.0.0.1", port), timeout=5).close()
-            break
-        except OSError:
-            assert time.monotonic() < ends
-    time.sleep(1)
-    command.send_signal(signal.SIGINT)
-    _, said = command.communicate(timeout=WAIT_SECONDS)
-    assert command.returncode == 130 and "Traceback" not in said
-    assert at_work.thread.is_alive()
+def test_ctrl_c_ends_the_command_and_leaves_the_training_alone(tmp_path: Path) -> None:
+    with TrainingAtWork(tmp_path) as training:
+        words = [sys.executable, "-m", "pipeline", "view", str(training.root), "--json"]
+        command = subprocess.Popen(
+            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=quiet_environment()
+        )
+        assert command.stdout is not None
+        port = int(re.findall(r":(\d+)/", json.loads(command.stdout.readline())["url"])[0])
+        ends = time.monotonic() + WAIT_SECONDS
+        while True:  # it answers
+            try:
+                socket.create_connection(("127.0.0.1", port), timeout=5).close()
+                break
+            except OSError:
+                assert time.monotonic() < ends
+        time.sleep(1)
+        command.send_signal(signal.SIGINT)
+        _, said = command.communicate(timeout=WAIT_SECONDS)
+        assert command.returncode == 130 and "Traceback" not in said
+        assert training.thread.is_alive(), training.error
 
 
 def test_a_server_beside_a_run_ends_with_it(tmp_path: Path) -> None:

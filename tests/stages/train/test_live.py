@@ -80,6 +80,11 @@ def test_a_full_disk_ends_no_training(tmp_path: Path) -> None:
     assert not (tmp_path / LIVE / STATE).exists()
 
 
+def test_a_figure_that_is_not_finite_ends_no_training(tmp_path: Path) -> None:
+    LiveFolder(tmp_path, saved).show({"train_psnr": float("inf")})
+    assert not (tmp_path / LIVE / STATE).exists()
+
+
 def test_watching_changes_no_step(tmp_path: Path, progress) -> None:
     def watch(step: int, _: float) -> None:
         touch(tmp_path / "b")
