@@ -85,6 +85,7 @@ def main() -> None:
     parser.add_argument("--workspaces", type=Path, required=True)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--steps", type=int, default=800)
+    parser.add_argument("--effects", nargs="+", choices=EFFECTS, default=list(EFFECTS), help="those that are forced")
     add_out(parser)
     given = parser.parse_args()
     record = Record(given.out)
@@ -94,7 +95,7 @@ def main() -> None:
         if "decided" not in made:
             made["decided"] = decided(given.data / name, workspace)
         for seed in given.seeds:
-            for forced in ("", *EFFECTS):
+            for forced in ("", *given.effects):
                 effects = {effect: on != (effect == forced) for effect, on in made["decided"].items()}
                 if f"{forced} {seed}" not in made["scores"]:
                     found, trained = scored(workspace, effects, seed, given.steps, made.get("downscale"))
@@ -103,8 +104,8 @@ def main() -> None:
                     scores.write_text(json.dumps(made, indent=1))
         raw = [made["scores"][f" {seed}"]["raw"] for seed in given.seeds]
         told = {"set": name, "decided_db": round(mean(raw), 2)}
-        for effect, on in made["decided"].items():
-            told |= cells(effect, on, made["scores"], given.seeds)
+        for effect in given.effects:
+            told |= cells(effect, made["decided"][effect], made["scores"], given.seeds)
         record.add(**told)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from jinja2 import Environment, StrictUndefined
 
+from benchmarks.published.literature import comparison
 from benchmarks.record import Figures, table_head, table_row, written
 
 ROOT = Path(__file__).parents[1]
@@ -35,10 +36,11 @@ def page() -> str:
         return f"`{record['command']}` · {record['date']} · {record['machine']} · {record['commit']}"
 
     rows = {name: [written(row) for row in record["figures"]] for name, record in records.items()}
+    published = records.get("published", {"figures": []})["figures"]
     template = Environment(undefined=StrictUndefined, autoescape=False, keep_trailing_newline=True).from_string(
         (RESULTS / "results.md.j2").read_text("utf-8")
     )
-    return template.render(rows, table=table, made=made)
+    return template.render(rows, table=table, made=made, comparison=comparison(published))
 
 
 def main() -> int:

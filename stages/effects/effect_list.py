@@ -56,9 +56,7 @@ def _vignetting() -> EffectParts:
     from nerf.effects.vignetting import VignettingModel
     from stages.effects.scene_statistics import measured_vignetting
 
-    return EffectParts(
-        lambda seen: vignetting_statistic(seen.tracks, seen.exposure), measured_vignetting, colours=VignettingModel
-    )
+    return EffectParts(lambda seen: vignetting_statistic(seen.darkening), measured_vignetting, colours=VignettingModel)
 
 
 def _pose_refinement() -> EffectParts:

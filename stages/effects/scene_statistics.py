@@ -12,7 +12,7 @@ from nerf.effects.statistics.outlier_images import OutlierImages, outlier_images
 from nerf.effects.statistics.poses import common_residuals, pose_statistic
 from nerf.effects.statistics.statistic import Statistic, unknown
 from nerf.effects.statistics.tracks import TrackColours
-from nerf.effects.statistics.vignetting import vignetting_slope
+from nerf.effects.statistics.vignetting import RadialSlope, radial_slope
 from nerf.effects.statistics.warnings import (
     across_rows,
     motion_to_next,
@@ -52,11 +52,12 @@ class Places(NamedTuple):
 
 
 class Observations(NamedTuple):
-    """All that statistics look at: ``tracks`` read off the photos, the ``exposure`` fitted to them, ``outliers`` among
-    the photos, the ``exif_ev`` that the camera wrote, and ``places``."""
+    """All that statistics look at: ``tracks`` read off the photos, the ``exposure`` and the ``darkening`` towards
+    corners fitted to them, ``outliers`` among the photos, the ``exif_ev`` that the camera wrote, and ``places``."""
 
     tracks: TrackColours
     exposure: ExposureFit
+    darkening: RadialSlope
     outliers: OutlierImages
     exif_ev: np.ndarray
     places: Places
@@ -76,6 +77,7 @@ def observed(
     return Observations(
         tracks=looked.tracks,
         exposure=exposure,
+        darkening=radial_slope(looked.tracks, exposure),
         outliers=outlier_images(looked.tracks, exposure, looked.expected),
         exif_ev=told_exposures(ingest, scene),
         places=observed_places(ingest, scene, points, uncertainty_px),
@@ -120,7 +122,7 @@ def measured_gains(seen: Observations) -> np.ndarray:
 def measured_vignetting(seen: Observations) -> np.ndarray:
     """The coefficients (views, 3) of nerf/effects/vignetting.py, equal ones, which make the slope over the squared
     radius that all cameras have in common; rounded like gains."""
-    falling = max(-vignetting_slope(seen.tracks, seen.exposure)[0], 0.0)
+    falling = max(-seen.darkening.slope, 0.0)
     return np.full((seen.tracks.views, 3), round(falling / 3, GAIN_DIGITS))
 
 

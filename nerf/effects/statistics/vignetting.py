@@ -1,5 +1,7 @@
 """Whether photos are darker towards their corners: what gains leave, against the square of the radius."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
@@ -14,23 +16,30 @@ from nerf.effects.statistics.tracks import TrackColours, log_light
 THRESHOLD_EV = 2 * MIN_EFFECT / (0.24 * VALUE_PER_LOG_LIGHT) / EV
 
 
-def vignetting_slope(tracks: TrackColours, fit: ExposureFit) -> tuple[float, float]:
-    """The slope of ln(light) over the square of the radius, mean of the channels, and its standard error; within photos
-    and points alike, so neither gains nor points that are always in corners pass for it. (0, inf): nothing is known."""
+class RadialSlope(NamedTuple):
+    """The slope of ln(light) over the square of the radius, mean of the channels, and its standard error ``noise``:
+    infinite where nothing is known, for the reason ``unknown_because``."""
+
+    slope: float
+    noise: float
+    unknown_because: str = ""
+
+
+def radial_slope(tracks: TrackColours, fit: ExposureFit) -> RadialSlope:
+    """Within photos and points alike, so neither gains nor points that are always in corners pass for it."""
     if not fit.known.any():
-        return 0.0, float("inf")
+        return RadialSlope(0.0, float("inf"), fit.unknown_because)
     y, square = log_light(tracks.colour[fit.used]), tracks.radius[fit.used] ** 2
     found = np.array([fit.layout.slope(y[:, channel], square, fit.weight[:, channel]) for channel in range(3)])
-    return float(found[:, 0].mean()), float(np.sqrt(np.mean(found[:, 1] ** 2)))
+    slope, noise = float(found[:, 0].mean()), float(np.sqrt(np.mean(found[:, 1] ** 2)))
+    return RadialSlope(slope, noise, "" if np.isfinite(noise) else "every point lies at one radius in all photos")
 
 
-def vignetting_statistic(tracks: TrackColours, fit: ExposureFit) -> Statistic:
+def vignetting_statistic(found: RadialSlope) -> Statistic:
     """By how much corners are darker than the middle, EV; below 0 they are brighter, which no lens makes them."""
-    if not fit.known.any():
-        return unknown("EV", THRESHOLD_EV, fit.unknown_because, False)
-    slope, noise = (figure / EV for figure in vignetting_slope(tracks, fit))
-    if not np.isfinite(noise):
-        return unknown("EV", THRESHOLD_EV, "every point lies at one radius in all photos", False)
+    if found.unknown_because:
+        return unknown("EV", THRESHOLD_EV, found.unknown_because, False)
+    slope, noise = found.slope / EV, found.noise / EV
     words = f"corners are {abs(slope):.2g} EV {'darker' if slope < 0 else 'brighter'} than the middle, ± {noise:.1g}"
     return classify(-slope, noise, THRESHOLD_EV, "EV", words)
 

@@ -33,7 +33,7 @@ def shining(seed: int, strength: float, **settings: object) -> TrackColours:
 def test_vignetting_is_found_under_exposures(gain: float) -> None:
     for seed in SEEDS:
         tracks = photographed_points(seed, log_gain=exposed(seed), vignetting=gain)
-        found = vignetting.vignetting_statistic(tracks, fit_exposure(tracks))
+        found = vignetting.vignetting_statistic(vignetting.radial_slope(tracks, fit_exposure(tracks)))
         assert abs(found.value + gain / EV) < 5 * found.noise
         assert found.called_for is (gain == -0.33), "no lens makes corners brighter"
         assert (" darker than " in found.words) == (gain < 0)
@@ -44,13 +44,15 @@ def test_exposure_is_not_mistaken_for_vignetting() -> None:
         tracks = photographed_points(seed, log_gain=exposed(seed), outliers=0.02)
         # photos of which some show points in their middle only
         tracks = replace(tracks, radius=np.where(tracks.view % 2, 0.3 * tracks.radius, tracks.radius))
-        assert vignetting.vignetting_statistic(tracks, fit_exposure(tracks)).called_for is False
+        assert (
+            vignetting.vignetting_statistic(vignetting.radial_slope(tracks, fit_exposure(tracks))).called_for is False
+        )
 
 
 def test_points_at_one_radius_say_nothing_of_vignetting() -> None:
     tracks = photographed_points(0)
     tracks = replace(tracks, radius=np.full(len(tracks), 0.5))
-    found = vignetting.vignetting_statistic(tracks, fit_exposure(tracks))
+    found = vignetting.vignetting_statistic(vignetting.radial_slope(tracks, fit_exposure(tracks)))
     assert found.called_for is False and found.words == "every point lies at one radius in all photos: nothing known"
 
 
@@ -182,7 +184,7 @@ def test_without_tracks_nothing_is_known() -> None:
     none = TrackColours.empty(3)
     fit = fit_exposure(none)
     for found, decided in (
-        (vignetting.vignetting_statistic(none, fit), False),
+        (vignetting.vignetting_statistic(vignetting.radial_slope(none, fit)), False),
         (view_dependence.view_dependence_statistic(none, fit), None),
         (passers_by(none, none), False),
         (passers_by(none, None), False),

@@ -1,0 +1,1 @@
+"""Our scores under the protocols of published tables, beside the figures of others."""

@@ -1,0 +1,50 @@
+"""LPIPS (Zhang et al. 2018) between renders of stage evaluate and the photos, where the user has its weights."""
+
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from nerf.geometry.scene import Scene
+from stages.io.pixels import load_pixels
+
+VGG = "vgg16-397923af.pth"  # torchvision's file in torch's cache
+Distance = Callable[[Tensor, Tensor], Tensor]
+
+
+def load_lpips() -> Distance | None:
+    """The network of the package lpips; None, with the reason, where something would have to be downloaded."""
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / VGG
+    missing = "the package lpips is not installed" if find_spec("lpips") is None else f"{weights} is not there"
+    if find_spec("lpips") is None or not weights.is_file():
+        print(f"LPIPS is not computed: {missing}", file=sys.stderr)
+        return None
+    return import_module("lpips").LPIPS(net="vgg", verbose=False)
+
+
+def mean_lpips(evaluate: Path, ingest: Path, scene: Scene, distance: Distance | None) -> float | None:
+    """Over the test photos at the size of their renders; transparent ones lie over white. None without a network."""
+    if distance is None:
+        return None
+    found = []
+    with torch.no_grad():
+        for view in scene.of_split("test"):
+            render = _picture(evaluate / "renders" / Path(view.file.removeprefix("images/")).with_suffix(".png"))
+            photo = _picture(ingest / view.file)
+            if photo.shape != render.shape:
+                photo = torch.nn.functional.interpolate(photo, render.shape[-2:], mode="area")
+            found.append(float(distance(2 * render - 1, 2 * photo - 1)))
+    return round(sum(found) / len(found), 3)
+
+
+def _picture(file: Path) -> Tensor:
+    """(1, 3, height, width) in [0, 1]."""
+    with Image.open(file) as opened:
+        width, height = opened.size
+    pixels = torch.from_numpy(load_pixels(file, width, height).copy()).permute(2, 0, 1)[None].float() / 255
+    return pixels[:, :3] if pixels.shape[1] == 3 else torch.lerp(torch.ones(()), pixels[:, :3], pixels[:, 3:])
