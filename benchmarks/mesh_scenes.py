@@ -250,7 +250,7 @@ def _on_ground(points: np.ndarray) -> np.ndarray:
 
 
 def _in_room(points: np.ndarray) -> np.ndarray:
-    return (np.abs(points - [0, 0, ROOM[2]]) < np.array(ROOM) + 0.2).all(axis=1)
+    return np.all(np.abs(points - [0, 0, ROOM[2]]) < np.array(ROOM) + 0.2, axis=1)
 
 
 def _legs(points: np.ndarray) -> np.ndarray:
@@ -263,7 +263,8 @@ def _legs(points: np.ndarray) -> np.ndarray:
 
 def _loaded(folder: Path) -> TexturedMesh:
     """The mesh of a folder, upright, standing at z = 0 over the origin, with its picture."""
-    loaded = trimesh.load(next(folder.glob("*.obj")), process=False, force="mesh", skip_materials=True)
+    loaded = trimesh.load_mesh(next(folder.glob("*.obj")), process=False, skip_materials=True)
+    assert isinstance(loaded.visual, trimesh.visual.TextureVisuals) and loaded.visual.uv is not None
     picture = np.asarray(Image.open(next(folder.glob("*.png"))).convert("RGB"), np.float32) / 255
     linear = srgb_to_linear(torch.from_numpy(picture)).numpy()
     vertices = np.asarray(loaded.vertices, float)[:, [0, 2, 1]] * [1, -1, 1]

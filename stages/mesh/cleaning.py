@@ -94,7 +94,7 @@ def _hidden(surface: Surface, visible: np.ndarray, points: np.ndarray) -> np.nda
     for _ in range(DILATION_STEPS):
         visible = _dilated(surface.faces, visible)
     if len(points) < MIN_POINTS:
-        hidden = _ends_openly(surface, ~visible[surface.faces].all(1))
+        hidden = _ends_openly(surface, ~np.all(visible[surface.faces], axis=1))
     else:
         tree, radius = _point_tree(points)
         supported = np.isfinite(tree.query(surface.vertices, distance_upper_bound=radius)[0])
