@@ -21,6 +21,7 @@ PIPELINE_ORDER = (
     "engine",
     "doctor",
     "demo",
+    "view",
     "batch",
     "cli",
     "__main__",
@@ -42,11 +43,13 @@ ALLOWED_BASES = {"Module", "Function", "Exception", "BaseException", "Enum", "In
 SLOW = {
     *("torch", "warp", "pycolmap", "kornia", "cv2", "trimesh", "skimage", "scipy", "matplotlib", "PIL", "pillow_heif"),
     *("numpy", "jaxtyping", "safetensors", "jinja2", "rich", "fast_simplification", "imageio_ffmpeg"),
+    *("starlette", "uvicorn"),
 }
 ONLY_ON_UNIX = {"resource", "fcntl", "termios"}
 LATE = {
     "pipeline/__main__.py": "Ctrl-C ends the program quietly while Python still reads it",
     "stages/train/validation_images.py": "kornia takes seconds, and few trainings score whole patches",
+    "pipeline/view/workspace_state.py": "the page is there at once, and torch takes seconds, which only a field needs",
     "benchmarks/nerfacto.py": "a part runs in nerfstudio's environment, where ours is not installed",
 }
 # What a test may replace beside the package that it mirrors (tests/stages/mesh: stages/mesh), and libraries.

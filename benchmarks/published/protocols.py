@@ -18,13 +18,16 @@ from nerf.geometry.scene import Scene
 
 BLENDER_SIZE, LLFF_SIZE = (800, 800), (1008, 756)
 BLENDER_PHOTOS = {"train": 100, "test": 200}
-BLENDER = dict.fromkeys(("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship"), 1)
-LLFF = dict.fromkeys(("fern", "flower", "fortress", "horns", "leaves", "orchids", "room", "trex"), 4)
-INDOOR, OUTDOOR = ("bonsai", "counter", "kitchen", "room"), ("bicycle", "flowers", "garden", "stump", "treehill")
+
+
+def _reduced(names: str, factor: int) -> dict[str, int]:
+    return dict.fromkeys(names.split(), factor)
+
+
 SCENES: Mapping[str, Mapping[str, int]] = {
-    "blender": BLENDER,
-    "llff": LLFF,
-    "mip360": dict.fromkeys(INDOOR, 2) | dict.fromkeys(OUTDOOR, 4),
+    "blender": _reduced("chair drums ficus hotdog lego materials mic ship", 1),
+    "llff": _reduced("fern flower fortress horns leaves orchids room trex", 4),
+    "mip360": _reduced("bonsai counter kitchen room", 2) | _reduced("bicycle flowers garden stump treehill", 4),
 }
 """Of each table its scenes, and by how much photos as taken are reduced."""
 MIP360_PHOTOS = {"bonsai": 292}  # as far as they are known here

@@ -9,15 +9,15 @@ replays them gives every step the learning rate it had before, and continues fro
 import math
 from typing import Literal, NamedTuple
 
-Reason = Literal["begin", "clock", "target", "more"]
+Reason = Literal["begin", "clock", "target", "finish", "more"]
 
-# A run that stops early at a target has a decay phase like any other: the last quarter of its steps.
+# A run that stops early, at a target or as the user wants it, has a decay phase like any other: its last quarter.
 DECAY_START_PROGRESS = 0.75
 
 
 class ScheduleRevision(NamedTuple):
     """From step ``from_step`` on, at this ``progress``, the run has ``total_steps``. ``reason``: it begins, the clock
-    says so, a target is near or reached, or the finished run is to train more."""
+    says so, a target is near or reached, the user wants it finished, or the finished run is to train more."""
 
     from_step: int
     total_steps: int
@@ -64,14 +64,14 @@ class StepSchedule(NamedTuple):
         """The revisions up to ``step``: later ones concern steps that are to be repeated."""
         return StepSchedule(tuple(revision for revision in self.revisions if revision.from_step <= step))
 
-    def with_decay_from(self, step: int) -> "StepSchedule":
+    def with_decay_from(self, step: int, reason: Reason = "target") -> "StepSchedule":
         """This schedule with the decay phase, the last quarter of a run, beginning at ``step``, or what is left of it
         if that is less. Raises ValueError if that rewrites an earlier revision or leaves no step."""
         if not self.revisions[-1].from_step <= step < self.total_steps:
             raise ValueError(f"the schedule {self.revisions} cannot decay from step {step}")
         total = min(self.total_steps, max(step + 1, round(step / DECAY_START_PROGRESS)))
         progress = max(DECAY_START_PROGRESS, self.progress(step))
-        return StepSchedule((*self.revisions, ScheduleRevision(step, total, progress, "target")))
+        return StepSchedule((*self.revisions, ScheduleRevision(step, total, progress, reason)))
 
     def ended_at(self, step: int) -> "StepSchedule":
         """This schedule without the steps from ``step`` on. Raises ValueError if that rewrites an earlier revision."""

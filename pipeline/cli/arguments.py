@@ -11,7 +11,7 @@ from types import NoneType
 from typing import Annotated, Any, TypeVar, Union, get_args
 
 import tyro
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 from tyro.constructors import PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from pipeline.cli.options import UsageError, wrong_options
@@ -87,6 +87,8 @@ class RunArguments:
     """Run this stage and all later ones again, even if they are cached."""
     config: Auto[Path] = None
     """A TOML file with a table of options per stage. Flags override it."""
+    view: bool = False
+    """Show the training in the browser while it runs."""
 
 
 @dataclass
@@ -140,6 +142,19 @@ class ResumeArguments:
 
     workspace: tyro.conf.Positional[Path]
     common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
+    view: bool = False
+    """Show the training in the browser while it runs."""
+
+
+@dataclass
+class ViewArguments:
+    """Show a workspace in the browser, and follow the training that runs in it. Ctrl-C leaves the training alone."""
+
+    workspace: tyro.conf.Positional[Path]
+    port: Auto[Annotated[int, Field(ge=1, le=65535)]] = None
+    """The port of this machine at which the page is served (default: a free one)."""
+    json: bool = False
+    """Print the address as a JSON object."""
 
 
 @dataclass
@@ -196,6 +211,7 @@ COMMANDS: dict[str, type] = {
     "run": RunArguments,
     "batch": BatchArguments,
     "resume": ResumeArguments,
+    "view": ViewArguments,
     "status": StatusArguments,
     "explain": ExplainArguments,
     "clean": CleanArguments,

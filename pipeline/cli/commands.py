@@ -7,7 +7,8 @@ import shutil
 import sys
 import time
 import traceback
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -33,6 +34,7 @@ from pipeline.engine.failures import StageFailed
 from pipeline.engine.runner import Runner
 from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace
+from pipeline.view import beside, check_installed, open_browser
 from stages.contract import StageError
 from stages.io.amounts import duration
 
@@ -115,6 +117,7 @@ def _command(name: str) -> Callable[[Sequence[str]], int]:
         "run": command_run,
         "batch": command_batch,
         "resume": command_resume,
+        "view": command_view,
         "status": command_status,
         "explain": command_explain,
         "clean": command_clean,
@@ -166,7 +169,8 @@ def command_run(words: Sequence[str]) -> int:
             display.failed(stage_list.SOURCE, error)
             return exit_codes.of_stage(stage_list.SOURCE)
         new_budget = None if given.more is not None else (budget, 0.0)
-        return _run_stages(root, asked, stages, given.common, display, force, new_budget=new_budget)
+        with _watched(root, given.view, display):
+            return _run_stages(root, asked, stages, given.common, display, force, new_budget=new_budget)
 
 
 def command_batch(words: Sequence[str]) -> int:
@@ -345,8 +349,34 @@ def command_resume(words: Sequence[str]) -> int:
     given = arguments.parse(arguments.ResumeArguments, "resume", words)
     workspace = Workspace.existing(given.workspace)
     stages = workspace.read_run().stages or stage_list.usual()
-    with choose_display(given.common.json) as display:
+    with choose_display(given.common.json) as display, _watched(given.workspace, given.view, display):
         return _run_stages(given.workspace, _recorded_settings(workspace), stages, given.common, display)
+
+
+@contextmanager
+def _watched(root: Path, wanted: bool, display: Display) -> Iterator[None]:
+    """The block, with a server for browsers beside it where that is ``wanted``."""
+    if not wanted:
+        yield
+        return
+    with beside(root) as url:
+        display.headline(f"view it: {url}")
+        open_browser(url)
+        yield
+
+
+def command_view(words: Sequence[str]) -> int:
+    """``pipeline view WORKSPACE``: until Ctrl-C."""
+    given = arguments.parse(arguments.ViewArguments, "view", words)
+    workspace = Workspace.existing(given.workspace)
+    check_installed()
+    from pipeline.view.server import ViewServer
+
+    server = ViewServer(workspace.root, given.port)
+    print(json.dumps({"event": "view", "url": server.url}) if given.json else f"view it: {server.url}", flush=True)
+    open_browser(server.url)
+    server.run()
+    return 0
 
 
 def _reader(root: Path) -> tuple[Workspace, Runner]:

@@ -16,13 +16,13 @@ from stages.effects.image_effects import new_view_words
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_bytes, check_memory
 from stages.io.field_files import load_field
-from stages.io.files import read_scene, read_tensors, write_png
+from stages.io.files import read_scene, read_tensors, write_png, write_tensors
 from stages.mesh.cleaning import Cleaned, boundary, clean
 from stages.mesh.files import WRITERS, Z_UP_TO_Y_UP, ColouredMesh
 from stages.mesh.holes import Closed, close_holes
 from stages.mesh.iso_level import RETRAIN, IsoLevel, check_range, choose_iso_level
 from stages.mesh.marching_cubes import extract_surface
-from stages.mesh.preview import preview
+from stages.mesh.preview import SMALL_COPY, preview, small_copy
 from stages.mesh.resolution import CHUNK, grid_box, point_cost, points_per_edge, slab_factor
 from stages.mesh.surface import Surface, decimate, face_areas, is_watertight, keep_faces, vertex_normals
 from stages.mesh.texture.texturing import Textured, texture_of
@@ -227,19 +227,23 @@ def save(config: "Config", extracted: Extracted, source: Source, folder: Path) -
 
 
 def write_mesh(config: "Config", mesh: ColouredMesh, source: Source, folder: Path) -> tuple[str, ...]:
-    """Write the files asked for, in the frame asked for, and preview.png; their names."""
+    """Write the files asked for, in the frame asked for; preview.png and the small copy in the scene frame; their
+    names."""
     write_png(folder / "preview.png", preview(mesh, source.scene))
+    names = ["preview.png"]
+    if (small := small_copy(mesh)) is not None:
+        write_tensors(folder / SMALL_COPY, small)
+        names.append(SMALL_COPY)
     files_from_scene = source.files_from_scene(config.frame)
     vertices, normals = files_from_scene.points(mesh.vertices), mesh.normals @ files_from_scene.rotation.T
     mesh, upright = mesh._replace(vertices=vertices, normals=normals), Z_UP_TO_Y_UP @ files_from_scene.rotation.T
-    names = []
     in_millimetres = mesh._replace(vertices=1000 * mesh.vertices) if config.frame == "metric" else mesh
     for extension in sorted(set(config.formats)):
         shown = in_millimetres if extension in PRINTED else mesh
         for name, content in WRITERS[extension](shown, upright).items():
             (folder / name).write_bytes(content)
             names.append(name)
-    return (*names, "preview.png")
+    return tuple(names)
 
 
 def _facts(config: "Config", extracted: Extracted, source: Source) -> dict[str, object]:

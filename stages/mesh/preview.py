@@ -1,17 +1,21 @@
-"""The preview picture of a mesh for the report: from two sides, in its colours and in clay."""
+"""The preview of a mesh: a picture from two sides, in colours and in clay, and a small copy that turns in pages."""
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from nerf.geometry.camera_paths import levelled
 from nerf.geometry.scene import Scene
 from stages.mesh.files import ColouredMesh
 from stages.mesh.rasteriser import Viewpoint, frame_mesh, rasterise, shade
+from stages.mesh.surface import Surface, decimate
 
 WIDTH, HEIGHT = 480, 400
 UP = np.array([0.0, 0.0, 1.0])
 ELEVATION = 30.0  # degrees above the horizon
 ROOM_FIELD_OF_VIEW = 75.0
 MIN_HORIZONTAL = 0.3  # least horizontal part of a direction for its azimuth to count: 73° above the horizon
+SMALL_COPY = "small_mesh.safetensors"
+SMALL_FACES, MAX_SMALL_VERTICES = 20_000, 65_536  # of the copy that turns: 0.3 MB in a page; indices have 16 bits
 COLOUR_SHADING = 0.35  # the colours hold the shading of the photos already
 
 
@@ -24,6 +28,25 @@ def preview(mesh: ColouredMesh, scene: Scene) -> np.ndarray:
         clay = shade(fragments, mesh.faces, None, camera, 1.0)
         rows.append(np.concatenate([colour, clay], axis=1))
     return np.concatenate(rows)
+
+
+def small_copy(mesh: ColouredMesh) -> dict[str, np.ndarray] | None:
+    """About SMALL_FACES faces of the mesh, for pages: ``positions`` int16, 32767 being the ``radius`` of the sphere
+    around the ``middle``, ``faces`` uint16, ``colours`` uint8. None for one that stays too large: it is all borders."""
+    small = decimate(Surface(mesh.vertices, mesh.faces), SMALL_FACES)
+    if len(small.vertices) > MAX_SMALL_VERTICES or not len(small.faces):
+        return None
+    low, high = small.vertices.min(axis=0), small.vertices.max(axis=0)
+    middle = (low + high) / 2
+    radius = float(np.linalg.norm(small.vertices - middle, axis=1).max()) or 1.0
+    _, nearest = KDTree(mesh.vertices).query(small.vertices)
+    return {
+        "positions": np.rint((small.vertices - middle) / radius * 32767).astype(np.int16),
+        "faces": small.faces.astype(np.uint16),
+        "colours": mesh.colours[nearest],
+        "middle": middle,
+        "radius": np.array([radius]),
+    }
 
 
 def viewpoints(vertices: np.ndarray, scene: Scene) -> tuple[Viewpoint, Viewpoint]:

@@ -20,6 +20,7 @@ from stages.io.amounts import duration, short_count
 from stages.io.ascii_names import shell_quoted
 from stages.io.files import read_json, read_scene, read_tensors
 from stages.io.pixels import load_pixels, pillow
+from stages.mesh.preview import SMALL_COPY
 from stages.report.cameras import (
     CameraReport,
     camera_models,
@@ -154,7 +155,8 @@ def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
         profile=profile_bar(results.profile),
         metrics=results.metrics,
         scored_on=scored_on(results.metrics) if results.metrics and results.metrics["images"] else None,
-        compared=_compared(results),
+        compared=(compared := _compared(results)),
+        opening=_opening(results, compared),
         video=_video(results.inputs, config.video_limit_mb),
         **_mesh_part(results),
         study=_study(results),
@@ -184,12 +186,32 @@ def _cameras_part(results: Results, names: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _mesh_part(results: Results) -> dict[str, Any]:
-    """Stage mesh: its picture, and the names of its files."""
+    """Stage mesh: its picture, its copy that turns, and the names of its files."""
     preview = results.inputs["mesh"] / "preview.png" if "mesh" in results.inputs else None
     files = results.manifests.get("mesh", {}).get("outputs", ())
     return {
         "mesh_preview": _data_uri(preview.read_bytes(), "image/png") if preview and preview.exists() else None,
-        "mesh_files": [name for name in files if name != "preview.png"],
+        "mesh_files": [name for name in files if name not in ("preview.png", SMALL_COPY)],
+        "turntable": _turntable(results),
+        "turntable_script": Markup(Path(__file__).with_name("turntable.js").read_text("utf-8")),
+    }
+
+
+def _turntable(results: Results) -> dict[str, Any] | None:
+    """The small copy of the mesh as turntable.js takes it, first seen from where the first training photo was taken;
+    None without one."""
+    file = results.inputs["mesh"] / SMALL_COPY if "mesh" in results.inputs else None
+    if file is None or not file.exists() or results.scene is None:
+        return None
+    small = read_tensors(file)
+    eye = results.scene.of_split("train")[0].scene_from_camera[:, 3] - small["middle"]
+    tilt = float(np.arctan2(eye[2], np.hypot(eye[0], eye[1])))
+    content = b"".join(small[name].tobytes() for name in ("positions", "faces", "colours"))
+    return {
+        "vertices": len(small["positions"]),
+        "faces": len(small["faces"]),
+        "start": [float(np.arctan2(eye[0], -eye[1])), tilt],
+        "data": base64.b64encode(content).decode("ascii"),
     }
 
 
@@ -322,6 +344,14 @@ def _compared(results: Results) -> dict[str, Any] | None:
         "small": [_pictures(results, ranked[rank], WIDTH_SMALL) for rank in small],
         "ranked": ranked,
     }
+
+
+def _opening(results: Results, compared: dict[str, Any] | None) -> dict[str, Any] | None:
+    """The picture that leads to the viewer: the best render of a test photo; None where there is neither."""
+    if not results.manifests.get("viewer", {}).get("facts", {}).get("drawn"):
+        return None
+    best = compared["large"][0] if compared else None
+    return {"render": best and best["render"], "aspect": best["aspect"] if best else 1.5, "name": best and best["name"]}
 
 
 def _pictures(results: Results, image: dict[str, Any], width: int) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from stages.contract import Note
 from stages.sfm import global_mapping
+from stages.sfm.colmap.database import adopt_cameras
 from stages.sfm.colmap.diagnosis import compare_models, disagree
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.mapping import incremental_options, map_globally, map_incrementally
@@ -30,6 +31,8 @@ from stages.sfm.colmap.thinning import thin_matches
 from stages.sfm.job import JobState
 from stages.sfm.matching import capture_sequence, consecutive_pairs
 from stages.sfm.retry_strategies import STRATEGIES, MappingOptions, Strategy
+
+MIN_PHOTOS_OF_CAMERA = 10  # in a row, for their camera to be taken for that of all
 
 
 class CheckedModel(NamedTuple):
@@ -58,24 +61,21 @@ def run_mapping(
         matches = state.sibling("thinned")
         hold_focal = thin_matches(database, matches, camera_is_known=camera_is_known) and mapping.hold_focal
     options = incremental_options(seed, mapping, camera_is_known, state.thinned, hold_focal)
+    trusted = consecutive_pairs(state) if strategy.matches == "consecutive" else set[tuple[int, int]]()
     if strategy.mapping is None:
         found = map_globally(matches, state.images, models, seed, camera_is_known)
+        shutil.rmtree(models)
     else:
-        registered = count(1)
-        found = map_incrementally(
-            matches, state.images, models, options, lambda: state.send(phase="mapping", done=next(registered))
-        )
+        found = _map_incrementally(matches, options, state)
         if found and hold_focal:
             release_focal_lengths(found[0])
-    shutil.rmtree(models)
+        if found and trusted:
+            found = _most_steps(found, matches, mapping, state, trusted)
     checked = CheckedModel(None, {}, False, False)
     failure = global_mapping.failure(beside) if beside else None
     other = load_native(beside.folder) if beside and not failure else None
     compared = None if beside is None else {"failed": failure}
     if found:
-        trusted = consecutive_pairs(state) if strategy.matches == "consecutive" else set[tuple[int, int]]()
-        if trusted:
-            found.sort(key=lambda model: longest_supported(model, state.database, trusted), reverse=True)
         before = found[0]
         if trusted:
             copy_consistent_matches(before, state.database, database, trusted)
@@ -87,6 +87,34 @@ def run_mapping(
             compared["taken"] = found[0] is other
     state.end("mapping")
     return found, checked, compared
+
+
+def _map_incrementally(matches: Path, options: Any, state: JobState) -> list[Any]:
+    models, registered = Path(state.job.folder, "models"), count(1)
+    found = map_incrementally(
+        matches, state.images, models, options, lambda: state.send(phase="mapping", done=next(registered))
+    )
+    shutil.rmtree(models)
+    return found
+
+
+def _most_steps(
+    found: list[Any], matches: Path, mapping: MappingOptions, state: JobState, trusted: Collection[tuple[int, int]]
+) -> list[Any]:
+    """The sub-models by how many photos hang together in them by ``trusted`` pairs; mapped once more with the cameras
+    of the first one held, if that makes it longer: where a photo sees one plane, a pair alone tells neither its pose
+    nor its camera (docs/experiments/match_graph.md)."""
+
+    def length(model: Any) -> int:
+        return longest_supported(model, state.database, trusted)
+
+    found = sorted(found, key=length, reverse=True)
+    if state.job.camera_params is not None or length(found[0]) < MIN_PHOTOS_OF_CAMERA:
+        return found
+    adopt_cameras(matches, found[0])
+    options = incremental_options(state.job.seed, mapping, camera_is_known=True, thinned=state.thinned)
+    again = sorted(_map_incrementally(matches, options, state), key=length, reverse=True)
+    return again if again and length(again[0]) > length(found[0]) else found
 
 
 def _comparison(model: Any, other: Any, checks: Sequence[Candidate], database: Path, state: JobState) -> dict[str, Any]:

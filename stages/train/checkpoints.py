@@ -3,6 +3,10 @@
 A checkpoint is a pair of files, ``<step>.safetensors`` and ``<step>.json``; the second holds the sha256 of the first
 and of its own facts and is written last, so a kill at any instant leaves at worst a pair that is not one, and a flipped
 bit anywhere in either does not pass.
+
+Before one is kept the field is checked, on training photos alone: has it collapsed or diverged? The full check runs
+once after the first steps and at the end. In between the batch PSNR, which costs nothing, tells when it is due:
+whenever it is near that of a flat colour.
 """
 
 import hashlib
@@ -14,10 +18,17 @@ from typing import Any, NamedTuple
 from safetensors.torch import load, save
 from torch import Tensor
 
+from nerf.training.evaluation_pixels import EvaluationPixels, evaluate
+from nerf.training.trainer import FieldTrainer
 from stages.io.files import write_durably
-from stages.train.health_check import TrainingFailure
 
 KEPT = 2
+MIN_OPACITY = 1e-3  # a field of less mean opacity shows nothing but background
+FULL_CHECK_MARGIN_DB = 3.0  # above a flat colour: batches that are no better may come from a collapsed field
+
+
+class TrainingFailure(Exception):
+    """The field in training has collapsed or diverged, for the reason given. Training rolls back or restarts."""
 
 
 class Checkpoint(NamedTuple):
@@ -93,3 +104,33 @@ def _read(folder: Path, step: int) -> Checkpoint:
     if _digest(f"{step:09d}", meta["facts"], tensors) != meta["sha256"]:
         raise ValueError("its content does not match its sha256")
     return Checkpoint(step, load(tensors), meta["facts"])
+
+
+# --- the health check
+
+
+def failure_reason(trainer: FieldTrainer, pixels: EvaluationPixels) -> str | None:
+    """Why the field, as the training photos see it, has collapsed or diverged; None if it has not."""
+    if name := non_finite_tensor(trainer):
+        return f"its {name} is not finite"
+    try:
+        rendered = evaluate(trainer.model, pixels, trainer.effects)
+    except ValueError as error:  # the PSNR is not finite
+        return f"its rendering is not finite: {error}"
+    if not rendered.opacity >= MIN_OPACITY:  # nor is NaN
+        return f"it is empty (mean opacity {rendered.opacity:.0e})"
+    if not rendered.psnr > pixels.mean_colour_psnr:
+        return f"it is no better than a flat colour ({rendered.psnr:.1f} of {pixels.mean_colour_psnr:.1f} dB)"
+    return None
+
+
+def needs_full_check(batch_psnr: float, pixels: EvaluationPixels) -> bool:
+    """Whether batches as bad as this call for :func:`failure_reason`."""
+    return not batch_psnr > pixels.mean_colour_psnr + FULL_CHECK_MARGIN_DB
+
+
+def non_finite_tensor(trainer: FieldTrainer) -> str | None:
+    """The name of a state tensor that is not finite, which the update after a finite loss can cause; None if there is
+    none."""
+    state = trainer.state().items()
+    return next((name for name, one in state if one.is_floating_point() and not bool(one.isfinite().all())), None)

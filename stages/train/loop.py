@@ -10,7 +10,8 @@ What can happen to a run, and what the loop does:
 * it collapses or diverges later, or at the end: back to the last checkpoint, as after a loss that is not finite. A run
   of fewer than MIN_HEALTHY_STEPS is too short to judge: it ends as undertrained, with the reason;
 * it continues a finished run: from that run's last checkpoint, at the learning rate of the longer run;
-* it comes near a target on validation photos: the learning rate decays early, and goes back up if that was not enough.
+* it comes near a target on validation photos: the learning rate decays early, and goes back up if that was not enough;
+* somebody watches it: it writes what they see (stages/train/live.py), and finishes early where they ask for it.
 """
 
 import json
@@ -20,6 +21,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from safetensors.torch import save
 
@@ -37,8 +39,16 @@ from stages.contract import Progress, StageError
 from stages.io.amounts import short_count
 from stages.io.files import read_json, write_durably
 from stages.io.stopwatch import live_line
-from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
-from stages.train.health_check import TrainingFailure, failure_reason, needs_full_check, non_finite_tensor
+from stages.train.checkpoints import (
+    Checkpoint,
+    TrainingFailure,
+    failure_reason,
+    latest_checkpoint,
+    needs_full_check,
+    non_finite_tensor,
+    save_checkpoint,
+)
+from stages.train.live import LiveFolder
 from stages.train.more import cannot_continue
 from stages.train.profile import profiled_step
 from stages.train.state import (
@@ -63,6 +73,7 @@ MAX_EVALUATION_FRACTION = 0.05  # of the time of a run in seconds
 DECAY_GAIN_DB = 1.0
 SCHEDULE_TOLERANCE = 0.01  # of a budget in seconds: how often the clock is read, and how far off a schedule may be
 PROVISIONAL_STEPS = 1_000_000  # the schedule of a run in seconds until its first step has been timed
+EARLY_ENDS = ("target", "finish")  # reasons of revisions after which the clock does not decide
 MAX_LOST_FRACTION = 0.5  # of a run in seconds: however often it is killed, the other half is left to train in
 
 
@@ -87,6 +98,7 @@ class TrainingRun:
         self.checkpoints = folder / "checkpoints"
         self.schedule_file, self.elapsed_file = folder / "schedule.json", folder / "elapsed.txt"
         self.speed, self.next_revision = TrainingSpeed(), 0.0
+        self.live: LiveFolder | None = None  # of a training that may be watched
         checkpoint = latest_checkpoint(self.checkpoints, progress.note, self._fits)
         if checkpoint is None and budget.after is not None:
             self._extend(budget.after)
@@ -108,6 +120,8 @@ class TrainingRun:
                 except (NonFinite, TrainingFailure) as failure:
                     self._roll_back(failure)
         self._save()
+        if self.live is not None:
+            self.live.close()
 
     @property
     def _is_finished(self) -> bool:
@@ -207,6 +221,8 @@ class TrainingRun:
             if time.monotonic() >= self.next_checkpoint:
                 self._check_health()
                 self._save()
+            if self.live is not None and time.monotonic() >= self.live.next_look:
+                self._heed_watchers(self.live)
         self._check_final_health()
         if not self._is_finished:
             self._evaluate()
@@ -235,7 +251,7 @@ class TrainingRun:
         self.next_revision = self.state.seconds + tolerance
         self.elapsed_file.write_text(f"{self.state.seconds + self.lost:.3f}")
         last = self.schedule.revisions[-1]
-        if not last.from_step <= step < self.schedule.total_steps or last.reason == "target":
+        if not last.from_step <= step < self.schedule.total_steps or last.reason in EARLY_ENDS:
             return
         speed = 1 / self.speed.seconds_per_step
         schedule = revised_by_clock(self.schedule, step, self.state.seconds, budget, speed, tolerance)
@@ -298,6 +314,43 @@ class TrainingRun:
             self.log.event("target-revision", step, total_steps=schedule.total_steps)
             if schedule.total_steps > step:
                 self.progress.note("train.target-revision", target_revision_message(self.state, target.psnr, schedule))
+
+    def _heed_watchers(self, live: LiveFolder) -> None:
+        """Show those who watch how it stands, and finish early where they ask for it. Before MIN_HEALTHY_STEPS nobody
+        could tell whether the field is sound: a request waits until then."""
+        wanted = live.is_asked_to_finish and self.schedule.revisions[-1].reason != "finish"
+        if wanted and MIN_HEALTHY_STEPS <= self.state.step < self.schedule.total_steps:
+            self._finish_early()
+        if live.look() and self.speed.count:
+            live.show(self._live_state())
+
+    def _finish_early(self) -> None:
+        """Begin the decay phase. The checkpoint comes first: a run in seconds that is resumed keeps no revision beyond
+        its checkpoint."""
+        self._check_health()
+        self._save()
+        self.schedule = self.schedule.with_decay_from(self.state.step, "finish")
+        self._write_schedule()
+        self.log.event("finish-requested", self.state.step, total_steps=self.schedule.total_steps)
+        steps = self.schedule.total_steps - self.state.step
+        self.progress.note(
+            "train.finish-requested", f"asked to finish: the learning rate decays over {steps:,} more steps"
+        )
+
+    def _live_state(self) -> dict[str, Any]:
+        """What a watcher is told."""
+        state, schedule = self.state, self.schedule
+        return {
+            "step": state.step,
+            "total_steps": schedule.total_steps,
+            "progress": schedule.progress(state.step),
+            "seconds": state.seconds,
+            "seconds_left": self._seconds_left(),
+            "rays_per_second": self.speed.rays_per_step / self.speed.seconds_per_step,
+            "train_psnr": self.speed.psnr,
+            "curve": [[point["seconds"], point["probe_psnr"], point["train_psnr"]] for point in state.curve],
+            "finishing": schedule.revisions[-1].reason == "finish",
+        }
 
     def _max_steps(self) -> int:
         """How many steps the budget allows for."""
@@ -410,10 +463,15 @@ class TrainingRun:
         """The live line, and the progress of the run."""
         if not self.speed.count:
             return "first step", 0.0
+        message = speed_message(self.state, self.speed, self._seconds_left())
+        return message, self.schedule.progress(self.state.step)
+
+    def _seconds_left(self) -> float:
+        """Until the last step, by the speed so far; by the clock where that ends the run."""
         left = (self.schedule.total_steps - self.state.step) * self.speed.seconds_per_step
-        if self.clock_budget is not None:
-            left = max(0.0, self.clock_budget - self.state.seconds)
-        return speed_message(self.state, self.speed, left), self.schedule.progress(self.state.step)
+        if self.clock_budget is None or self.schedule.revisions[-1].reason in EARLY_ENDS:
+            return left
+        return max(0.0, self.clock_budget - self.state.seconds)
 
 
 def speed_message(state: RunState, speed: TrainingSpeed, left: float) -> str:

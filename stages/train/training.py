@@ -1,7 +1,7 @@
 """One training as a stage: photos and settings are loaded, steps taken, the field saved with what came of them."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -29,6 +29,7 @@ from stages.train.curve import (
 )
 from stages.train.data import field_background, guided_dataset
 from stages.train.fields.field_list import field_of, make_trainer
+from stages.train.live import LiveFolder
 from stages.train.loop import TrainingRun
 from stages.train.more import budget_of, earlier_seconds
 from stages.train.precision import precision_facts, say_if_inexact
@@ -59,6 +60,7 @@ def load(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Tr
     if config.target_psnr is not None:
         scene = _with_validation_photos(config.target_psnr, scene, progress)
     run = prepare(config, scene, inputs, folder, progress)
+    run.live = LiveFolder(folder, lambda shown: save_field(shown, run.trainer.model, _field_info(config, scene, run)))
     say_if_inexact(config, progress)
     return Training(config, scene, run, earlier)
 
@@ -134,10 +136,7 @@ def save(training: Training, folder: Path, progress: Progress) -> StageResult:
     """Write the field with the record of how it came about."""
     config, scene, run, _ = training
     assert config.downscale is not None, "plan() chooses it"
-    info = {"downscale": config.downscale, "steps": run.state.step, "rays": run.state.rays}
-    info["background"] = list(field_background(config, scene))
-    info["effects"] = learnt_effects(run.trainer.effects, scene.of_split("train"))
-    save_field(folder, run.trainer.model, info)
+    save_field(folder, run.trainer.model, _field_info(config, scene, run))
     write_curve(folder, config.kind, config.downscale, run.schedule.is_single_cycle, run.state.curve)
     progress.update("measuring what this machine can do")
     with use_matmul_precision(config.matmul):
@@ -149,6 +148,17 @@ def save(training: Training, folder: Path, progress: Progress) -> StageResult:
     final = checkpoint_files(run.checkpoints, run.state.step)
     records = ("curve.json", "log.jsonl", "schedule.json", *profile, *final, *batches, *tensorboard)
     return StageResult(("field.safetensors", "field.json"), _summary(training), records, _facts(training))
+
+
+def _field_info(config: Config, scene: Scene, run: TrainingRun) -> dict[str, Any]:
+    """What field.json says beside the field itself."""
+    return {
+        "downscale": config.downscale,
+        "steps": run.state.step,
+        "rays": run.state.rays,
+        "background": list(field_background(config, scene)),
+        "effects": learnt_effects(run.trainer.effects, scene.of_split("train")),
+    }
 
 
 def _closing_notes(training: Training) -> list[str]:

@@ -80,17 +80,17 @@ def load(config: "Config", inputs: Inputs, progress: Progress) -> Contents:
             "Train it again with this version.",
         )
     table, comparison = _table(config, inputs, renderer, field, scene, progress)
-    parts = sections(renderer.field, table) | {"palette": _palette()} | _points(inputs)
+    parts = sections(renderer.field, table) | {"palette": palette()} | sparse_points(inputs)
     header = {
         "field": description(renderer.field, table)
-        | _gains(new_view_effects(field))
+        | gains_of(new_view_effects(field))
         | {"background": field["background"]},
-        "scene": _scene(scene, inputs),
+        "scene": scene_header(scene, inputs),
         "exposure": "exposure" in field["effects"],
         "appearance": new_view_words(field),
         "comparison": comparison._asdict(),
         "inverse_depth": _inverse_depths(renderer, scene),
-        "views": [_view(scene, view, field) for view in scene.views],
+        "views": [view_header(scene, view, field) for view in scene.views],
     }
     if config.photos == "on":
         progress.update("shrinking the photos", 0.5)
@@ -138,7 +138,7 @@ def _compared(
     return Comparison(len(views), float(trained), float(of_packed))
 
 
-def _gains(effects: tuple[ColourEffect, ...]) -> dict[str, list[float]]:
+def gains_of(effects: tuple[ColourEffect, ...]) -> dict[str, list[float]]:
     """``log_gain`` on the optical axis, per channel, and ``falloff`` from there: vignetting's three coefficients and
     1 / (4 sin²(θ/2)) of the corner."""
     log_gain, falloff = np.zeros(3), [0.0] * 4
@@ -158,9 +158,9 @@ def _gains(effects: tuple[ColourEffect, ...]) -> dict[str, list[float]]:
 # --- what was photographed
 
 
-def _scene(scene: Scene, inputs: Inputs) -> dict[str, Any]:
+def scene_header(scene: Scene, inputs: Inputs) -> dict[str, Any]:
     usual, sfm_from_scene = median_camera(scene), scene.scene_from_sfm.inverse()
-    metres = metres_per_unit(inputs["scale"])
+    metres = metres_per_unit(inputs["scale"]) if "scale" in inputs else None  # while a lone stage train is watched
     return {
         "bounded": scene.bounded,
         "has_alpha": scene.has_alpha,
@@ -188,7 +188,7 @@ def _lens(camera: Camera) -> list[float]:
     return [width, height, focal[0], focal[-1], *centre]
 
 
-def _view(scene: Scene, view: View, field: dict[str, Any]) -> dict[str, Any]:
+def view_header(scene: Scene, view: View, field: dict[str, Any]) -> dict[str, Any]:
     """A camera with its photo's own exposure and vignetting."""
     return {
         "name": view.name,
@@ -196,7 +196,7 @@ def _view(scene: Scene, view: View, field: dict[str, Any]) -> dict[str, Any]:
         "pose": view.scene_from_camera.tolist(),
         "lens": _lens(scene.cameras[view.camera]),
         "near_far": [view.near, view.far],
-    } | _gains(photo_effects(field, scene, view))
+    } | gains_of(photo_effects(field, scene, view))
 
 
 def _inverse_depths(renderer: Renderer, scene: Scene) -> list[float]:
@@ -211,13 +211,13 @@ def _inverse_depths(renderer: Renderer, scene: Scene) -> list[float]:
     return [float(low), float(high) if high > low else float(low) + 1.0]
 
 
-def _palette() -> bytes:
+def palette() -> bytes:
     """The colours of depth, far to near (turbo), as RGBA."""
     bgr = cv2.applyColorMap(np.arange(PALETTE_SIZE, dtype=np.uint8)[None], cv2.COLORMAP_TURBO)
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGBA).tobytes()
 
 
-def _points(inputs: Inputs) -> dict[str, bytes]:
+def sparse_points(inputs: Inputs) -> dict[str, bytes]:
     """Sparse points, MAX_POINTS of them at most, evenly among all."""
     points = read_tensors(inputs["normalise"] / "points.safetensors")
     chosen = spread(len(points["xyz"]), min(MAX_POINTS, len(points["xyz"])))

@@ -5,14 +5,16 @@ import gzip
 import json
 import struct
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from stages.contract import StageResult
 from stages.io.amounts import bytes_in_words
-from stages.viewer.contents import Contents
+
+if TYPE_CHECKING:
+    from stages.viewer.contents import Contents
 
 FILES = Path(__file__).with_name("page")
 SHADERS = ("space", "field", "march", "overlay")
@@ -20,10 +22,10 @@ SCRIPTS = ("geometry", "contents", "graphics", "renderer", "overlay", "navigatio
 ALIGNMENT = 8  # of a section, for typed arrays
 
 
-def save(contents: Contents, folder: Path) -> StageResult:
+def save(contents: "Contents", folder: Path) -> StageResult:
     """Write viewer.html."""
     payload = packed(contents)
-    text = page(contents.header["field"] is not None, payload)
+    text = page("not drawn" if contents.loss_db is None else "still", payload)
     (folder / "viewer.html").write_text(text, "utf-8")
     size = (folder / "viewer.html").stat().st_size
     if contents.loss_db is None:
@@ -34,27 +36,32 @@ def save(contents: Contents, folder: Path) -> StageResult:
     return StageResult(("viewer.html",), line, facts=facts)
 
 
-def packed(contents: Contents) -> str:
-    """Header and sections as gzip in base64: the header's length, the header, the sections at the places that it says,
-    counted from behind the header. Names of photos stand in there alone, so no HTML ever holds them."""
+def packed(contents: "Contents") -> str:
+    """:func:`binary` as gzip in base64. Names of photos stand in there alone, so no HTML ever holds them."""
+    return base64.b64encode(gzip.compress(binary(contents), 9, mtime=0)).decode("ascii")
+
+
+def binary(contents: "Contents") -> bytes:
+    """The header's length, the header in JSON, the sections at the places that it says, counted from behind the header,
+    each as typed arrays want it."""
     places, body = dict[str, tuple[int, int]](), bytearray()
     for name, content in contents.sections.items():
         places[name] = len(body), len(content)
         body += content + bytes(-len(content) % ALIGNMENT)
     header = json.dumps({**contents.header, "sections": places}, allow_nan=False).encode()
     header += b" " * (-(len(header) + 4) % ALIGNMENT)
-    whole = struct.pack("<I", len(header)) + header + bytes(body)
-    return base64.b64encode(gzip.compress(whole, 9, mtime=0)).decode("ascii")
+    return struct.pack("<I", len(header)) + header + bytes(body)
 
 
-def page(drawn: bool, payload: str) -> str:
-    """The HTML around it."""
+def page(kind: Literal["still", "not drawn", "live"], payload: str = "") -> str:
+    """The HTML around the contents; of a training at work, ``live``, these come from a server."""
     environment = Environment(
         loader=FileSystemLoader(FILES), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
-    parts: dict[str, Any] = {"drawn": drawn, "payload": Markup(payload), "style": Markup(_text("style.css"))}
-    shaders = json.dumps({name: _text(f"{name}.glsl") for name in SHADERS})
-    script = "\n".join([f"const SHADERS = {shaders};", *(_text(f"{name}.js") for name in SCRIPTS)])
+    parts: dict[str, Any] = {"kind": kind, "payload": Markup(payload), "style": Markup(_text("style.css"))}
+    scripts = (*SCRIPTS, "live") if kind == "live" else SCRIPTS
+    shaders = json.dumps({name: _text(f"shaders/{name}.glsl") for name in SHADERS})
+    script = "\n".join([f"const SHADERS = {shaders};", *(_text(f"{name}.js") for name in scripts)])
     return environment.get_template("page.html.j2").render(**parts, script=Markup(script))
 
 

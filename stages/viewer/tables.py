@@ -99,8 +99,11 @@ def with_table(field: HashGridField, table: Table) -> HashGridField:
     return like
 
 
-def sections(field: HashGridField, table: Table) -> dict[str, bytes]:
-    """The binary parts of the page that make the field up. Matrices are by columns, as std140 has them."""
+def sections(field: HashGridField, table: Table, by_rows: bool = False) -> dict[str, bytes]:
+    """The binary parts of the page that make the field up. Matrices are by columns, as std140 has them.
+
+    ``by_rows``: the table as a texture takes it, which costs no time, instead of in planes, which gzip shrinks best.
+    """
     weights = {name: value.detach().cpu().numpy() for name, value in field.weights._asdict().items()}
     full_scale = MAX_CODE if table.bits == 8 else 1  # a normalised texture reads the largest byte as 1
     scaled = weights["density_hidden"] * (full_scale * table.scales.reshape(-1, 1))
@@ -112,7 +115,7 @@ def sections(field: HashGridField, table: Table) -> dict[str, bytes]:
     colour = [_layer(geometry), _layer(direction), _layer(colour_out, output=True)]
     words = field.occupancy_bits.cpu().numpy().view(np.uint32).reshape(-1, 2)
     parts = {
-        "table": table.planes(),
+        "table": table.codes.tobytes() if by_rows else table.planes(),
         "density_network": np.concatenate(density, axis=None).tobytes(),
         "colour_network": np.concatenate(colour, axis=None).tobytes(),
         "occupancy": words.tobytes(),
@@ -131,13 +134,14 @@ def _layer(weights: Float[np.ndarray, "others hidden"], output: bool = False) ->
     return np.ascontiguousarray(columns, np.float32).reshape(-1, 4, 4)
 
 
-def description(field: HashGridField, table: Table) -> dict[str, Any]:
-    """What the page must know of the field beside its numbers."""
+def description(field: HashGridField, table: Table, by_rows: bool = False) -> dict[str, Any]:
+    """What the page must know of the field beside its numbers; ``by_rows`` as for :func:`sections`."""
     settings, stepping = field.settings, field.render_stepping
     return {
         "space": vars(settings.space) | {"half": settings.space.half},
         "levels": _levels(field.layout),
         "bits": table.bits,
+        "by_rows": by_rows,
         "step_size": stepping.step_size,
         "cone_angle": stepping.cone_angle,
         "max_samples": stepping.max_samples,

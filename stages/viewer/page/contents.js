@@ -1,10 +1,14 @@
 // What stages/viewer/page.py packed into the page.
 
-/** The header and a function from a section's name to its bytes. */
+/** What stands in the page itself. */
 async function unpacked(base64) {
   const packed = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
-  const whole = await new Response(stream).arrayBuffer();
+  return contentsOf(await new Response(stream).arrayBuffer());
+}
+
+/** The header and a function from a section's name to its bytes. */
+function contentsOf(whole) {
   const length = new DataView(whole).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(whole, 4, length)));
   const section = (name) => {

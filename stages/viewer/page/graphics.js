@@ -9,15 +9,23 @@ class Graphics {
   constructor(canvas, contents) {
     this.gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: false });
     if (!this.gl) throw new Error("no WebGL2");
-    this.contents = contents;
-    const { gl } = this, { field, section } = contents;
+    const { gl } = this, { field } = contents;
     this.field = this.program(
       "out vec2 at;\nvoid main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }",
       [defines(field), SHADERS.space, SHADERS.field, SHADERS.march].join("\n"));
     this.quad = this.program("#define VERTEX\n#define QUAD\n" + SHADERS.overlay, "#define QUAD\n" + SHADERS.overlay);
     this.drawing = this.program("#define VERTEX\n" + SHADERS.overlay, SHADERS.overlay);
+    this.load(contents);
+  }
+
+  /** Hands the numbers of a field of the same sizes to the graphics chip, in place of those before. */
+  load(contents) {
+    const { gl } = this, { field, section } = contents;
+    this.contents = contents;
+    this.buffers?.forEach((buffer) => gl.deleteBuffer(buffer));
+    this.textures?.forEach((texture) => gl.deleteTexture(texture));
     this.buffers = ["density_network", "colour_network"].map((name, index) => this.block(index, floats(section(name))));
-    const table = interleaved(section("table"), field.levels, field.bits / 8);
+    const table = field.by_rows ? section("table").slice() : interleaved(section("table"), field.levels, field.bits / 8);
     const format = field.bits === 8 ? [gl.RGBA8_SNORM, gl.BYTE, new Int8Array(table.buffer)] : half(gl, table);
     this.textures = [
       this.texture(gl.RGBA, ...format, 4),

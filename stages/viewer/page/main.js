@@ -68,6 +68,14 @@ class Viewer {
     requestAnimationFrame((next) => this.frame(next, time));
   }
 
+  /** Another field of the same scene, and the exposures that go with it. */
+  replace({ field, gains, section }) {
+    const { contents } = this, before = contents.section;
+    contents.views.forEach((view, index) => Object.assign(view, gains[index]));
+    Object.assign(contents, { field, section: (name) => section(name) ?? before(name) });
+    this.renderer.load(contents);
+  }
+
   /** Some part of what is shown was changed. */
   changed() {
     this.renderer.touch();
@@ -206,21 +214,36 @@ class Viewer {
   }
 }
 
+const say = (text) => (byId("message").textContent = text);
+
+/** Why this browser cannot show a scene; null where it can. */
+function missing() {
+  if (!window.WebGL2RenderingContext) return "This browser has no WebGL 2, with which the scene is drawn. Any current Chrome, Firefox or Safari has it.";
+  if (!window.DecompressionStream) return "This browser is too old to unpack the scene. Chrome 80, Firefox 113, Safari 16.4 and later can.";
+  return null;
+}
+
+/** Draws the contents from now on. */
+async function open(contents) {
+  say("Preparing the graphics chip …");
+  await new Promise((resume) => setTimeout(resume, 30));
+  window.viewer = new Viewer(byId("canvas"), contents);
+  say("");
+}
+
+function sayWhyNot(error) {
+  say(error.message === "no WebGL2"
+    ? "WebGL 2 is turned off in this browser or not supported by its graphics driver; the scene is drawn with it."
+    : `The scene cannot be drawn here: ${error.message}`);
+  throw error;
+}
+
 async function start() {
-  const canvas = document.getElementById("canvas"), message = document.getElementById("message");
-  const cannot = (why) => (message.textContent = why);
-  if (!window.WebGL2RenderingContext) return cannot("This browser has no WebGL 2, with which the scene is drawn. Any current Chrome, Firefox or Safari has it.");
-  if (!window.DecompressionStream) return cannot("This browser is too old to unpack the scene. Chrome 80, Firefox 113, Safari 16.4 and later can.");
+  const why = missing();
+  if (why) return say(why);
   try {
-    const contents = await unpacked(document.getElementById("payload").textContent);
-    message.textContent = "Preparing the graphics chip …";
-    await new Promise((resume) => setTimeout(resume, 30));
-    window.viewer = new Viewer(canvas, contents);
-    message.textContent = "";
+    await open(await unpacked(byId("payload").textContent));
   } catch (error) {
-    cannot(error.message === "no WebGL2"
-      ? "WebGL 2 is turned off in this browser or not supported by its graphics driver; the scene is drawn with it."
-      : `The scene cannot be drawn here: ${error.message}`);
-    throw error;
+    sayWhyNot(error);
   }
 }

@@ -84,7 +84,7 @@ class Panels {
       if (group.children.length) list.append(group);
     }
     list.addEventListener("change", () => list.value !== "" && viewer.showPhoto(Number(list.value)));
-    byId("photos-note").textContent = section("photo0") ? "" : "This file contains no photos.";
+    byId("photos-note").textContent = section("photo0") ? "" : byId("payload") ? "This file contains no photos." : "Photos are in the page of the finished run.";
     const step = (by) => viewer.showPhoto((viewer.photo + by + views.length) % views.length);
     this.on("photo-before", "click", () => step(-1));
     this.on("photo-after", "click", () => step(1));
@@ -150,18 +150,18 @@ class Panels {
   about() {
     const { field, comparison, appearance, scene, sections } = this.viewer.contents, list = byId("about");
     const rows = field.levels.reduce((sum, level) => sum + level.rows, 0);
-    const bytes = byId("payload").textContent.length;
+    const bytes = byId("payload")?.textContent.length;
     const facts = {
       Field: `${field.levels.length} hash grids, ${(rows / 1e6).toFixed(2)} million rows of 4 features, up to ${field.levels.at(-1).resolution} cells a side`,
       Space: { box: "a box", contraction: "all of space, contracted", ndc: "normalised device coordinates" }[field.space.kind],
-      Numbers: `${field.bits} bits each; ${(bytes / (4 * rows)).toFixed(2)} bytes of this file per number`,
-      "Loss by packing": `${(comparison.trained_db - comparison.packed_db).toFixed(3)} dB: ${comparison.packed_db.toFixed(2)} instead of `
-        + `${comparison.trained_db.toFixed(2)} dB on ${comparison.views} reduced photos`,
+      Numbers: `${field.bits} bits each` + (bytes ? `; ${(bytes / (4 * rows)).toFixed(2)} bytes of this file per number` : ""),
+      ...(comparison && { "Loss by packing": `${(comparison.trained_db - comparison.packed_db).toFixed(3)} dB: ${comparison.packed_db.toFixed(2)} instead of `
+        + `${comparison.trained_db.toFixed(2)} dB on ${comparison.views} reduced photos` }),
       "Work of a pixel": `${field.levels.length * 8} table reads at each sample on its ray`,
       Appearance: appearance ?? "as the photos show it",
-      Scale: scene.metres_per_unit ? `a scene unit is ${scene.metres_per_unit.toPrecision(4)} m (by GPS)` : "unknown: lengths are in scene units",
+      Scale: scene.metres_per_unit ? `a scene unit is ${scene.metres_per_unit.toPrecision(4)} m` : "unknown: lengths are in scene units",
       Photos: sections.photo0 ? `${this.viewer.contents.views.length} small copies are in this file` : "none are in this file",
-      Network: "this file never uses any",
+      Network: bytes ? "this file never uses any" : "this page asks the server on your own machine, and nobody else",
     };
     for (const [name, text] of Object.entries(facts)) {
       for (const [tag, content] of [["dt", name], ["dd", text]]) {

@@ -14,8 +14,8 @@ class Renderer {
    *  on top of it. */
   constructor(canvas, contents, request, over) {
     Object.assign(this, { canvas, contents, request, over });
-    this.movingPixels = MIN_PIXELS;
-    this.stripPixels = MIN_PIXELS;
+    this.movingPixels = this.stripPixels = MIN_PIXELS;
+    this.share = 1; // of the time that strips may take: less where a training needs the machine
     this.restore();
   }
 
@@ -28,8 +28,18 @@ class Renderer {
 
   /** Something has changed: what is shown is out of date. */
   touch() {
-    this.touched = now();
+    this.restsUntil = now() + STILL_MS;
     this.stale = true;
+    this.keeps = false;
+    this.filled = 0;
+  }
+
+  /** The field is another. A view that rests keeps its picture, in which the new one fills in. */
+  load(contents) {
+    this.contents = contents;
+    this.graphics.load(contents);
+    if (!this.isDone) return this.touch();
+    this.keeps = true;
     this.filled = 0;
   }
 
@@ -39,7 +49,7 @@ class Renderer {
     this.fitCanvas();
     if (this.job && !this.finished()) return;
     if (this.stale) this.drawCoarse();
-    else if (this.coarse && this.filled < this.canvas.height && now() - this.touched > STILL_MS) this.drawStrip();
+    else if (this.coarse && this.filled < this.canvas.height && now() > this.restsUntil) this.drawStrip();
   }
 
   get isDone() {
@@ -88,7 +98,7 @@ class Renderer {
 
   drawStrip() {
     const { width, height } = this.canvas;
-    if (!this.filled) {
+    if (!this.filled && !this.keeps) {
       this.fine = this.sized(this.fine, width, height);
       this.graphics.copy(this.coarse, this.fine);
     }
@@ -98,6 +108,7 @@ class Renderer {
     this.start(() => this.graphics.draw(this.fine, request, height - to, height - from), (ms) => {
       this.stripPixels = Math.max(width, width * (to - from) * clamp(STRIP_MS / ms, 1 / MAX_GROWTH, MAX_GROWTH));
       if (this.stale) return;
+      this.restsUntil = now() + ms * (1 / this.share - 1);
       this.filled = to;
       this.show(this.fine);
     });

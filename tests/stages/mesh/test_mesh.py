@@ -131,7 +131,7 @@ def test_metres_need_a_scale_that_is_known(run_mesh):
 
 def test_a_ball_becomes_a_closed_ball_in_the_sfm_frame(run_mesh, progress):
     result, folder = run_mesh(Solid(ball), formats=("glb", "ply", "obj"))
-    assert result.outputs == ("mesh.glb", "mesh.obj", "mesh.ply", "preview.png")
+    assert result.outputs == ("preview.png", "small_mesh.safetensors", "mesh.glb", "mesh.obj", "mesh.ply")
     assert all((folder / name).stat().st_size > 1000 for name in result.outputs)
     assert result.line.endswith("faces, 1 component, watertight")
     for name in ("mesh.ply", "mesh.obj"):

@@ -8,7 +8,7 @@ import pytest
 from nerf.geometry.camera_paths import look_at
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages.mesh.files import ColouredMesh
-from stages.mesh.preview import ELEVATION, preview, viewpoints
+from stages.mesh.preview import ELEVATION, SMALL_FACES, preview, small_copy, viewpoints
 
 CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 UP = np.array([0, 0, 1.0])
@@ -79,3 +79,34 @@ def test_the_picture_has_two_rows_of_colour_and_clay(monkeypatch, centre):
     assert image.shape == (60, 80, 3)
     redness = image[..., 0] - image[..., 1]
     assert (redness[:, :40] > 60).any() and redness[:, 40:].max() < 20
+
+
+def terrain(side: int) -> ColouredMesh:
+    """A wavy square of 2 (side − 1)² faces far from the origin, red where it is high."""
+    x, y = np.meshgrid(np.linspace(-1, 1, side), np.linspace(-1, 1, side), indexing="ij")
+    z = 0.2 * np.sin(3 * x) * np.cos(2 * y)
+    corner = np.arange(side * side).reshape(side, side)
+    a, b, c, d = (corner[i : side - 1 + i, j : side - 1 + j].ravel() for i, j in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]).astype(np.int32)
+    vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3) + np.array([50.0, 0, 0])
+    colours = np.stack([np.where(z > 0, 255, 0), 0 * z, 0 * z], axis=-1).reshape(-1, 3).astype(np.uint8)
+    return ColouredMesh(vertices, faces, np.tile(UP, (len(vertices), 1)), colours)
+
+
+def test_the_copy_that_turns_is_small_and_the_same_shape():
+    mesh = terrain(160)
+    small = small_copy(mesh)
+    assert small is not None and 0.8 * SMALL_FACES < len(small["faces"]) <= SMALL_FACES
+    assert sum(part.nbytes for part in small.values()) < 300_000
+    back = small["positions"] / 32767 * small["radius"] + small["middle"]
+    assert np.allclose(back.min(axis=0), mesh.vertices.min(axis=0), atol=1e-3)
+    x, y, z = (back - [50, 0, 0]).T
+    assert 0 < np.abs(z - 0.2 * np.sin(3 * x) * np.cos(2 * y)).max() < 0.005
+    high = np.abs(z) > 0.02
+    assert ((small["colours"][:, 0] == 255) == (z > 0))[high].all()
+
+
+def test_a_mesh_that_is_all_borders_has_no_copy():
+    mesh = terrain(120)
+    loose = mesh._replace(vertices=mesh.vertices[mesh.faces.ravel()], colours=mesh.colours[mesh.faces.ravel()])
+    assert small_copy(loose._replace(faces=np.arange(3 * len(mesh.faces), dtype=np.int32).reshape(-1, 3))) is None

@@ -5,10 +5,13 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from stages.io.files import write_json
+from stages.io.files import write_json, write_tensors
+from stages.mesh.preview import SMALL_COPY
 from tests.stages.report.report_workspace import make_workspace, written
+from tests.stages.viewer.browser import WAIT_SECONDS, chromium
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +35,7 @@ def test_commands_can_be_copied_into_a_shell(name: str, word: str, tmp_path: Pat
 
 def test_the_order_of_three_pictures_is_told_where_they_are(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     html, _ = written(inputs, tmp_path / "out", progress)
-    story = ["6 dB more is half the error", "<b>render</b><b>photo</b>", "; drag to compare.", "Below: the photo"]
+    story = ["<b>render</b><b>photo</b>", "; drag to compare.", "6 dB more is half the error", "Below: the photo"]
     places = [html.index(words) for words in (*story, '<span class="tag">best')]
     assert places == sorted(places)
 
@@ -56,7 +59,7 @@ def test_scored_and_shown_photos_may_be_some(tmp_path: Path, progress: Any):
 def test_files_beside_the_page_are_named(tmp_path: Path, progress: Any):
     inputs = make_workspace(tmp_path)
     manifest = json.loads((inputs["mesh"] / "manifest.json").read_text("utf-8"))
-    manifest["outputs"] = {name: {} for name in ("mesh.glb", "mesh.ply", "preview.png")}
+    manifest["outputs"] = {name: {} for name in ("mesh.glb", "mesh.ply", "preview.png", SMALL_COPY)}
     manifest["facts"] |= {"voxel": 0.25, "surface_area": 3.5, "iso_level": 40.0}
     write_json(inputs["mesh"] / "manifest.json", manifest)
     html, _ = written(inputs, tmp_path / "out", progress, video_limit_mb=0.001)
@@ -92,4 +95,70 @@ def test_paper_shows_what_it_can(inputs: dict[str, Path], tmp_path: Path, progre
     html, _ = written(inputs, tmp_path / "out", progress)
     style = re.search(r"@media print \{.*?\n\}", html, re.DOTALL)
     assert style is not None and ".film, .compare," in style[0] and "zoom" in style[0]
-    assert html.index('<section class="film">') < html.index("<h2>A new camera path")
+    assert html.index('<section class="film half">') < html.index("<h2>A new camera path")
+
+
+def with_mesh_and_viewer(root: Path) -> dict[str, Path]:
+    """The workspace with a red triangle as its mesh, and a viewer."""
+    inputs = make_workspace(root)
+    inputs["viewer"] = inputs["mesh"].parents[1] / "viewer" / inputs["mesh"].name
+    inputs["viewer"].mkdir(parents=True)
+    manifest = json.loads((inputs["mesh"] / "manifest.json").read_text("utf-8"))
+    facts = {"drawn": True, "bits": 8, "loss_db": 0.0, "bytes": 1}
+    write_json(inputs["viewer"] / "manifest.json", manifest | {"stage": "viewer", "facts": facts, "line": "2 MB"})
+    corners = np.array([[-20000, 0, -20000], [20000, 0, -20000], [0, 0, 20000]], np.int16)
+    red = np.tile(np.array([220, 20, 20], np.uint8), (3, 1))
+    parts = {"positions": corners, "faces": np.array([[0, 1, 2]], np.uint16), "colours": red}
+    write_tensors(inputs["mesh"] / SMALL_COPY, parts | {"middle": np.zeros(3), "radius": np.ones(1)})
+    return inputs
+
+
+def test_the_page_opens_with_the_way_to_the_viewer(tmp_path: Path, progress: Any):
+    inputs = with_mesh_and_viewer(tmp_path)
+    html, _ = written(inputs, tmp_path / "out", progress)
+    link = re.findall(r'<a class="opening" href="viewer.html".*?</a>', html, re.DOTALL)
+    assert len(link) == 1 and link[0].count("<img") == 1 and html.index(link[0]) < html.index("<h1>")
+    del inputs["evaluate"]
+    few, _ = written(inputs, tmp_path / "few", progress)
+    assert "<img" not in re.findall(r"<a class=.opening.*?</a>", few, re.DOTALL)[0]
+    del inputs["viewer"]
+    assert 'href="viewer.html"' not in written(inputs, tmp_path / "none", progress)[0]
+
+
+def test_the_mesh_turns(tmp_path: Path, progress: Any):
+    written(with_mesh_and_viewer(tmp_path), tmp_path / "out", progress)
+    with chromium() as browser:
+        page, faults = browser.new_page(viewport={"width": 500, "height": 700}), []
+        page.on("console", lambda message: faults.append(message.text))
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        page.set_default_timeout(1000 * WAIT_SECONDS)
+        page.goto((tmp_path / "out/report.html").as_uri())
+        canvas = page.locator("#turntable")
+        canvas.scroll_into_view_if_needed()
+        assert not page.locator("img.still").is_visible()
+        pictures = [canvas.screenshot()]
+        for key in ("ArrowRight", "ArrowUp", "+"):
+            canvas.press(key)
+            pictures.append(canvas.screenshot())
+        box = canvas.bounding_box()
+        assert box is not None
+        page.mouse.move(box["x"] + 60, box["y"] + 60)
+        page.mouse.down()
+        page.mouse.move(box["x"] + 120, box["y"] + 60)
+        page.mouse.up()
+        pictures.append(canvas.screenshot())
+        page.locator("#clay").click()
+        pictures.append(canvas.screenshot())
+        assert len(set(pictures)) == len(pictures) and faults == []
+
+
+@pytest.mark.parametrize("width", [320, 800, 1400, 2560])
+def test_no_screen_is_too_narrow_and_wide_ones_are_used(tmp_path: Path, progress: Any, width: int):
+    written(with_mesh_and_viewer(tmp_path), tmp_path / "out", progress)
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": width, "height": 800})
+        page.set_default_timeout(1000 * WAIT_SECONDS)
+        page.goto((tmp_path / "out/report.html").as_uri())
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        halves = page.evaluate("[...document.querySelectorAll('.half')].map((e) => e.getBoundingClientRect().left)")
+        assert len(set(halves)) == (2 if width >= 1280 else 1)

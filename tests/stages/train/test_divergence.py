@@ -23,10 +23,10 @@ from stages.ingest.decoding import DecodeError, decode
 from stages.io.field_files import load_field
 from stages.io.files import read_scene
 from stages.train import loop
+from stages.train.checkpoints import failure_reason
 from stages.train.data import training_dataset
 from stages.train.fields.field_list import make_trainer, with_defaults
 from stages.train.fields.hash_grid_options import HashGridOptions
-from stages.train.health_check import failure_reason
 from tests.refusals import refused
 from tests.stages.photo_scene import photographed
 

@@ -16,7 +16,7 @@ from nerf.geometry.rays import Rays, rays_of_view
 CHROMIUM = Path("/usr/bin/chromium")
 SOFTWARE_GL = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 STALL = "GPU stall due to ReadPixels"  # a hint of the driver: to wait is what a test wants
-WAIT_SECONDS = 120  # for a page on a busy machine
+WAIT_SECONDS = 300  # for a page on a busy machine
 
 
 @contextmanager
@@ -32,25 +32,29 @@ def chromium() -> Iterator[Any]:
 
 
 class Viewer:
-    """A loaded page. ``faults``: errors, console messages and requests other than for the file itself."""
+    """A loaded page, of a file or of a server. ``faults``: errors, console messages and requests for anything else."""
 
     def __init__(
-        self, browser: Any, file: Path, width: int = 120, height: int = 90, fragment: str = "", **options: Any
+        self, browser: Any, source: Path | str, width: int = 120, height: int = 90, fragment: str = "", **options: Any
     ) -> None:
         self.context = browser.new_context(viewport={"width": width, "height": height}, **options)
         self.page, self.faults = self.context.new_page(), list[str]()
+        self.own = source if isinstance(source, str) else source.as_uri()
         self.page.on("console", lambda message: self._told(message.text))
         self.page.on("pageerror", lambda error: self.faults.append(str(error)))
         self.page.on("request", lambda request: self._requested(request.url))
-        self.page.goto(file.as_uri() + fragment)
-        self.until("window.viewer !== undefined || document.getElementById('message')?.textContent.includes('cannot')")
+        self.page.set_default_timeout(1000 * WAIT_SECONDS)
+        self.page.goto(self.own + fragment)
+        self.until(
+            "window.viewer || window.follower || document.getElementById('message')?.textContent.includes('cannot')"
+        )
 
     def _told(self, text: str) -> None:
         if STALL not in text:
             self.faults.append(text)
 
     def _requested(self, url: str) -> None:
-        if not url.startswith(("file:", "blob:", "data:")):
+        if not url.startswith((self.own, "blob:", "data:")):
             self.faults.append(url)
 
     def run(self, script: str, argument: Any = None) -> Any:

@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 
 from nerf.effects.appearance import AppearanceModel
-from stages import viewer
+from nerf.rendering.srgb import linear_light, srgb_values
+from stages import train, viewer
 from stages.contract import run_stage
 from stages.effects.image_effects import photo_effects
-from stages.io.files import read_json
+from stages.io.field_files import load_field
+from stages.io.files import read_json, write_json
 from stages.render.path import path_from_file
 from stages.viewer.tables import quantised, with_table
 from tests.conftest import SilentProgress
-from tests.stages.photo_scene import FOCAL, HEIGHT, WIDTH
+from tests.stages.photo_scene import FOCAL, HEIGHT, WIDTH, ball_photo, photographed
 from tests.stages.viewer.browser import Viewer, chromium, pinhole_rays, psnr, rendered, request_of
 from tests.stages.viewer.made_fields import Made, gains, inside_pose, made, renamed
 
@@ -82,6 +84,60 @@ def test_16_bits_colours_without_directions_and_effects(browser: Any, tmp_path: 
     colour, _ = rendered(shown, pinhole_rays(view.scene_from_camera, lens, (2.0, 4.0)), [0.0, 0.0, 0.0])  # pyright: ignore
     assert psnr(drawn[..., :3], colour) > MIN_AGREEMENT
     assert not page.run("document.getElementById('exposure-row').hidden")
+    page.close()
+
+
+def test_the_exposure_slider_makes_a_stop_more_light(browser: Any, tmp_path: Path):
+    """Twice the light in linear values, as by nerf/effects/exposure.py; what is clipped aside."""
+    effects = {"exposure": gains([f"{index}.png" for index in range(8)])["exposure"]}
+    field = made(tmp_path, "contraction", effects=effects)
+    (tmp_path / "viewer").mkdir()
+    run_stage(viewer, viewer.Config(bits="8"), field.inputs, tmp_path / "viewer", SilentProgress())
+    page = Viewer(browser, tmp_path / "viewer/viewer.html", 60, 45)
+    before = page.shown().reshape(-1, 4)[:, :3] / 255
+    page.run("() => { const e = byId('exposure'); e.value = 1; e.dispatchEvent(new Event('input')); }")
+    assert page.run("byId('exposure-value').textContent") == "+1 EV"
+    after = page.shown().reshape(-1, 4)[:, :3] / 255
+    expected = srgb_values(2 * linear_light(before))
+    kept = (expected < 0.95) & (before > 0.1)
+    assert kept.mean() > 0.2 and np.abs(after - expected)[kept].max() < 0.03
+    page.close()
+
+
+def test_a_path_is_played_back_from_key_to_key(ball: Viewer):
+    keys = ball.run("viewer.contents.views.slice(0, 3).map((view) => view.pose)")
+    ball.run("(keys) => { viewer.path.keys = keys; window.seen = []; }", keys)
+    ball.run("window.draw = viewer.moved.bind(viewer)")
+    ball.run("() => { viewer.moved = (kind) => { seen.push(viewer.navigation.pose.centre); draw(kind); }; }")
+    ball.run("viewer.play(0.5)")
+    seen = np.array(ball.run("seen"))
+    assert len(seen) > 3 and np.allclose(seen[-1], keys[2]["centre"])
+    away = np.linalg.norm(seen - keys[0]["centre"], axis=1)
+    assert away[0] < 0.2 and (np.diff(away) > -1e-9).all(), "from the first key to the last, forwards"
+    ball.run("() => { delete viewer.moved; viewer.path.keys = []; viewer.reset(); }")
+    ball.until("!viewer.navigation.flight")
+
+
+def test_a_photo_beside_its_render_scores_as_in_python(browser: Any, tmp_path: Path):
+    inputs, scene = photographed(tmp_path, channels=4)
+    for name in ("train", "scale", "viewer"):
+        (tmp_path / name).mkdir()
+        inputs[name] = tmp_path / name
+    write_json(inputs["scale"] / "scale.json", {"metres_per_unit": None})
+    grid: Any = {"num_levels": 3, "log2_hashmap_size": 12, "max_res": 32, "target_samples": 2048}
+    run_stage(train, train.Config(steps=150, downscale=1.0, grid=grid), inputs, inputs["train"], SilentProgress())
+    run_stage(viewer, viewer.Config(), inputs, inputs["viewer"], SilentProgress())
+    field, info = load_field(inputs["train"])
+    page, index = Viewer(browser, inputs["viewer"] / "viewer.html", WIDTH, HEIGHT), 0
+    ball, view = ball_photo(4) / 255, scene.views[index]
+    photo = ball[..., :3] * ball[..., 3:] + np.array(info["background"]) * (1 - ball[..., 3:])
+    page.run(f"viewer.showPhoto({index})")
+    page.until(f"viewer.photo === {index}")
+    shown = page.shown().reshape(HEIGHT, WIDTH, 4)[..., :3] / 255
+    lens = [WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]
+    rays = pinhole_rays(view.scene_from_camera, lens, (view.near, view.far))
+    colour, _ = rendered(field, rays, info["background"])  # pyright: ignore[reportArgumentType]
+    assert psnr(colour, photo) > 18 and abs(psnr(shown, photo) - psnr(colour, photo)) < 0.3
     page.close()
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from stages.io.photos import Photo
 from stages.sfm import global_mapping
+from stages.sfm.colmap.database import adopt_cameras
 from stages.sfm.colmap.diagnosis import compare_models
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.mapping import incremental_options, map_incrementally
@@ -303,3 +304,12 @@ def test_models_that_disagree_name_images_with_different_poses(made: Made) -> No
     compared = compare_models(made.model, other)
     assert (compared["photos"], compared["agree"]) == (PHOTOS, PHOTOS - 2)
     assert sorted(compared["different"]) == sorted(names)
+
+
+def test_adopted_cameras_are_those_of_the_model(made: Made) -> None:
+    model = pycolmap.Reconstruction(made.model)
+    model.camera(1).focal_length = 1.5 * FOCAL_PX
+    adopt_cameras(made.database, model)
+    with pycolmap.Database.open(made.database) as db:
+        (camera,) = db.read_all_cameras()
+    assert camera.mean_focal_length() == 1.5 * FOCAL_PX and camera.has_prior_focal_length

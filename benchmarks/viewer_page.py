@@ -1,0 +1,115 @@
+"""How far the picture of viewer.html is from the Python renderer's, and how well it measures.
+
+    pipeline run PHOTOS --until viewer
+    python -m benchmarks.viewer_page PHOTOS.nerf
+    python -m benchmarks.viewer_page demo/demo.nerf --truth demo/truth.json
+
+A row per test photo: PSNR between the page's picture and the renderer's of the field as it was trained, at SIDE pixels,
+without distortion; how much better or worse the page's picture scores against its small photo than the renderer's. With
+--truth (of `pipeline demo`'s photos) also lengths between points that are clicked: the median error of LENGTHS of them.
+"""
+
+import argparse
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from benchmarks.record import Record, add_out
+from nerf.geometry.alignment import align
+from nerf.geometry.rays import rays_of_view
+from nerf.geometry.scene import Scene, View
+from nerf.synthetic.scenes import still_life
+from pipeline.demo.truth import Truth
+from pipeline.engine.workspace import Workspace
+from stages.effects.image_effects import photo_effects
+from stages.io.files import read_json, read_scene
+from stages.render.renderer import Renderer, load_renderer
+from tests.stages.viewer.browser import Viewer, chromium, pinhole_rays, psnr, request_of
+
+SIDE, VIEWS, LENGTHS = 320, 4, 40
+MIN_LENGTH = 0.2  # of a pair, in units of the truth, whose table is 2.4 across
+
+
+def pictures(page: Viewer, renderer: Renderer, info: dict[str, Any], scene: Scene, index: int) -> dict[str, float]:
+    """The figures of one photo but lengths."""
+    view, of_page = scene.views[index], page.run(f"viewer.contents.views[{index}]")
+    lens, (width, height) = of_page["lens"], (of_page["lens"]["width"], of_page["lens"]["height"])
+    shrink = max(width, height) / SIDE
+    size = [round(width / shrink), round(height / shrink)]
+    small = [*size, *(lens[name] * size[0] / width for name in ("fx", "fy", "cx", "cy"))]
+    gains = {"logGain": of_page["log_gain"], "falloff": of_page["falloff"]}
+    request = request_of(view.scene_from_camera, small, (view.near, view.far), **gains)
+    drawn = page.picture(size[0], size[1], request)[..., :3]
+    rays = pinhole_rays(view.scene_from_camera, small, (view.near, view.far)).each(
+        lambda part: part.to(renderer.device)
+    )
+    rendered = renderer.through(photo_effects(info, scene, view, renderer.device)).render(rays).colour
+    colour = rendered.clamp(0, 1).cpu().numpy()
+    photo = page.run(f"Array.from(viewer.contents.section('photo{index}'))")
+    with Image.open(BytesIO(bytes(photo))) as opened:
+        pixels = np.asarray(opened.resize((size[0], size[1]), Image.Resampling.BOX)) / 255
+    return {
+        "page_against_renderer_db": round(psnr(drawn, colour), 1),
+        "score_difference_db": round(psnr(drawn, pixels) - psnr(colour, pixels), 3),
+    }
+
+
+def length_error(page: Viewer, truth: Truth, scene: Scene, view: View, index: int) -> float:
+    """In percent, the median over pairs of clicked pixels."""
+    names = [each.name for each in scene.views if each.name in truth.poses]
+    of_scene = np.stack([each.scene_from_camera[:, 3] for each in scene.views if each.name in truth.poses])
+    scale = align(of_scene, np.stack([truth.poses[name][:, 3] for name in names])).scale
+    page.run(f"viewer.showPhoto({index})")
+    page.until(f"viewer.photo === {index}")
+    width, height = page.run("[viewer.canvas.width, viewer.canvas.height]")
+    random = np.random.default_rng(0)
+    clicks = random.uniform([0.3 * width, 0.4 * height], [0.7 * width, 0.9 * height], (2 * LENGTHS, 2))
+    lens = page.run("fitted(viewer.lens, viewer.canvas.width, viewer.canvas.height)")
+    at = np.stack([(clicks[:, 0] - lens["cx"]) / lens["fx"], (clicks[:, 1] - lens["cy"]) / lens["fy"]], axis=1)
+    directions = np.concatenate([at, np.ones((len(at), 1))], axis=1)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    pose = torch.tensor(truth.poses[view.name]).float()
+    rays = rays_of_view(torch.tensor(directions).float()[None], pose, 0.0, 100.0).each(lambda part: part[0])
+    distance = still_life(truth.seed).intersect(rays.origins, rays.directions).amin(0)
+    known = (rays.origins + distance[:, None] * rays.directions).numpy()
+    errors = []
+    for i in range(0, len(clicks), 2):
+        true = np.linalg.norm(known[i] - known[i + 1])
+        measure = f"viewer.measured = []; viewer.measure({clicks[i, 0]}, {clicks[i, 1]}); "
+        page.run(f"() => {{ {measure} viewer.measure({clicks[i + 1, 0]}, {clicks[i + 1, 1]}); }}")
+        found = page.run("viewer.measured.length === 2 ? norm(subtract(...viewer.measured)) : null")
+        if found is not None and np.isfinite(true) and true > MIN_LENGTH:
+            errors.append(abs(found * scale / true - 1))
+    return round(100 * float(np.median(errors)), 2)
+
+
+def main() -> None:
+    """Each workspace, a few of its test photos."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("workspaces", nargs="+", type=Path)
+    parser.add_argument("--truth", type=Path)
+    add_out(parser)
+    given = parser.parse_args()
+    record = Record(given.out)
+    truth = Truth.read(given.truth) if given.truth else None
+    with chromium() as browser:
+        for root in given.workspaces:
+            workspace, keys = Workspace.existing(root), Workspace.existing(root).read_run().keys
+            train = workspace.folder("train", keys["train"])
+            scene = read_scene(workspace.folder("normalise", keys["normalise"]))
+            page = Viewer(browser, workspace.folder("viewer", keys["viewer"]) / "viewer.html", SIDE, SIDE)
+            tests = [index for index, view in enumerate(scene.views) if view.split == "test"][:VIEWS]
+            for index in tests:
+                figures = pictures(page, load_renderer(train), read_json(train / "field.json"), scene, index)
+                if truth is not None:
+                    figures["length_error_percent"] = length_error(page, truth, scene, scene.views[index], index)
+                record.add(scene=root.name.removesuffix(".nerf"), photo=scene.views[index].name, **figures)
+            page.close()
+
+
+if __name__ == "__main__":
+    main()

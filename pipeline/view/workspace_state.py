@@ -1,0 +1,161 @@
+"""What a workspace has to show: nothing yet, a training at work, one that was stopped, one that is finished.
+
+All of it comes from files, read anew each time, so it does not matter which side is started, ended or killed first.
+"""
+
+import json
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+from typing import TYPE_CHECKING, Any, Literal
+
+from pipeline.engine import manifests
+from pipeline.engine.manifests import BadManifest
+from pipeline.engine.workspace import Workspace
+from stages.contract import StageError
+from stages.train.live import LIVE, STATE, ask_to_finish, touch
+from stages.viewer import INPUTS
+from stages.viewer.page import binary
+
+if TYPE_CHECKING:
+    from stages.viewer.live import LiveContents
+
+Phase = Literal["waiting", "training", "stopped", "finished"]
+FINISHED = "finished"  # the name of a finished training's field; others are those of snapshots
+
+
+@dataclass(frozen=True)
+class Training:
+    """Where a training stands: its folder, and what it last said of itself."""
+
+    phase: Phase
+    folder: Path | None
+    told: dict[str, Any]
+
+    @property
+    def field(self) -> str | None:
+        """The name of its latest field; None before the first."""
+        return FINISHED if self.phase == "finished" else self.told.get("field")
+
+    def field_folder(self, name: str) -> Path | None:
+        """Where the field of that name lies; None where it is not there any more."""
+        if self.folder is None or name != self.field:
+            return None
+        return self.folder if name == FINISHED else self.folder / LIVE / name
+
+
+class WorkspaceState:
+    """Answers the server's questions about one workspace. Its calls may come from any thread."""
+
+    def __init__(self, root: Path) -> None:
+        self.workspace, self.lock = Workspace(root), Lock()
+        self.contents: LiveContents | None = None
+        self.of_scene: tuple[Path, ...] = ()
+        self.packed: tuple[str, bytes] = ("", b"")
+
+    @staticmethod
+    def prepare() -> None:
+        """Load what packs fields, which takes seconds, before the first page asks for one."""
+        import stages.viewer.live  # noqa: F401
+
+    def training(self) -> Training:
+        """The training that the workspace's recorded run has, or is to have."""
+        running = self.workspace.running() is not None
+        key = self._keys().get("train")
+        if key is None:
+            return Training("waiting" if running else "stopped", None, {})
+        partial, finished = self.workspace.partial("train", key), self.workspace.folder("train", key)
+        told = _told(partial)
+        if partial.is_dir() and (running or told):
+            return Training("training" if running else "stopped", partial, told)
+        try:
+            manifest = manifests.read(finished)
+        except (FileNotFoundError, BadManifest):
+            return Training("waiting" if running else "stopped", None, {})
+        return Training("finished", finished, _told_by(manifest.facts, finished))
+
+    def watched(self) -> dict[str, Any]:
+        """What a page is told, which from now on counts as one that watches."""
+        training = self.training()
+        if training.phase == "training" and training.folder is not None:
+            touch(training.folder)
+        told = {name: value for name, value in training.told.items() if name != "field"}
+        return told | {"phase": training.phase, "field": training.field}
+
+    def finish(self) -> bool:
+        """Ask the training to end early; False where none is at work."""
+        training = self.training()
+        return training.phase == "training" and training.folder is not None and ask_to_finish(training.folder)
+
+    def finished_page(self) -> Path | None:
+        """viewer.html, where nothing newer is on its way."""
+        page = self.workspace.root / "output" / "viewer.html"
+        return page if self.training().phase == "finished" and page.is_file() else None
+
+    def scene(self) -> bytes | None:
+        """Cameras, points and what else does not change; None before there is a field."""
+        with self.lock:
+            training = self.training()
+            folder = training.field_folder(training.field) if training.field else None
+            if folder is None or (contents := self._contents()) is None:
+                return None
+            try:
+                return binary(contents.scene_contents(folder))
+            except (FileNotFoundError, StageError):  # the training has gone on meanwhile: the page asks again
+                return None
+
+    def field(self, name: str) -> bytes | None:
+        """The field of that name, packed once for all pages; None where it is not the latest any more."""
+        with self.lock:
+            if self.packed[0] == name and name != FINISHED:
+                return self.packed[1]
+            folder = self.training().field_folder(name)
+            if folder is None or (contents := self._contents()) is None:
+                return None
+            try:
+                self.packed = name, binary(contents.field_contents(folder))
+            except (FileNotFoundError, StageError):
+                return None
+            return self.packed[1]
+
+    def _contents(self) -> "LiveContents | None":
+        """What packs fields of the scene as it is now; None before that is known."""
+        from stages.viewer.live import LiveContents
+
+        keys = self._keys()
+        folders = {name: self.workspace.folder(name, keys[name]) for name in INPUTS if name in keys and name != "train"}
+        there = {name: folder for name, folder in folders.items() if (folder / manifests.NAME).is_file()}
+        if "normalise" not in there:
+            return None
+        if self.contents is None or self.of_scene != tuple(there.values()):
+            self.contents, self.of_scene = LiveContents(there), tuple(there.values())
+        return self.contents
+
+    def _keys(self) -> dict[str, str]:
+        try:
+            return self.workspace.read_run().keys
+        except StageError:  # the next run says so
+            return {}
+
+
+def _told(partial: Path) -> dict[str, Any]:
+    try:
+        return json.loads((partial / LIVE / STATE).read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def _told_by(facts: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """What a finished training says of itself, as one at work does."""
+    curve: list[dict[str, Any]] = []
+    with suppress(OSError, ValueError, KeyError):  # a record, which nothing needs
+        curve = json.loads((folder / "curve.json").read_text("utf-8"))["points"]
+    return {
+        "step": facts["steps"],
+        "total_steps": facts["steps"],
+        "progress": 1.0,
+        "seconds": facts["train_seconds"],
+        "train_psnr": facts["train_psnr"],
+        "curve": [[point["seconds"], point["probe_psnr"], point["train_psnr"]] for point in curve],
+    }

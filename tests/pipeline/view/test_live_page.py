@@ -1,0 +1,60 @@
+"""The page of a training at work, in a browser."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.pipeline.view.test_server import Served
+from tests.pipeline.view.training_at_work import TrainingAtWork
+from tests.stages.viewer.browser import Viewer, chromium
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as running:
+        yield running
+
+
+def test_it_follows_a_training_to_the_end_it_asks_for(browser: Any, tmp_path: Path) -> None:
+    with TrainingAtWork(tmp_path) as training:
+        server = Served(training.root)
+        page = Viewer(browser, server.server.url)
+        page.until("follower.shown && viewer.renderer.isDone")
+        first, field = page.shown(), page.run("follower.shown")
+        assert page.run("document.querySelectorAll('b').length") == 0, "a name is text and no HTML"
+        page.until(f"follower.shown !== '{field}' && document.querySelector('#live-curve polyline')")
+        assert np.abs(page.shown() - first).max() > 10
+        page.until("follower.state.step > 500")
+        page.run("document.getElementById('finish').click()")
+        training.wait()
+        page.until("follower.shown === 'finished'")
+        assert page.run("document.getElementById('live-phase').textContent").startswith("Finished")
+        assert page.run("document.getElementById('finish').hidden")
+        assert np.ptp(page.shown()) > 100
+        server.close()
+        assert page.faults == []
+        page.close()
+
+
+def test_it_says_when_its_server_is_gone(browser: Any, tmp_path: Path) -> None:
+    server = Served(TrainingAtWork(tmp_path).root)
+    page = Viewer(browser, server.server.url)
+    page.until("document.getElementById('live-phase').textContent.includes('No training')")
+    server.close()
+    page.until("document.getElementById('live-phase').textContent.includes('server has ended')")
+    page.close()
+
+
+def test_a_vanilla_training_shows_its_figures(browser: Any, tmp_path: Path) -> None:
+    with TrainingAtWork(tmp_path, field="vanilla") as training:
+        server = Served(training.root)
+        page = Viewer(browser, server.server.url)
+        page.until("follower.cannot")
+        assert "hash-grid" in page.run("document.getElementById('message').textContent")
+        page.until("follower.state.step > 1")
+        assert page.faults == []
+        page.close()
+        server.close()

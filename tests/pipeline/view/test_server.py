@@ -1,0 +1,274 @@
+"""The server of `pipeline view`: whom it answers, what it says, and that it and the training need not each other."""
+
+import http.client
+import json
+import os
+import re
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from pipeline import view
+from pipeline.view.server import ViewServer, listening
+from stages.train.live import FINISH, LIVE
+from tests.pipeline.view.training_at_work import (
+    KEYS,
+    TrainingAtWork,
+    can_reach_other_address,
+    quiet_environment,
+)
+from tests.refusals import refused
+from tests.stages.viewer.made_fields import NAMES
+
+WAIT_SECONDS = 300
+
+
+class Answer(NamedTuple):
+    status: int
+    headers: dict[str, str]
+    body: bytes
+
+    @property
+    def told(self) -> dict[str, Any]:
+        return json.loads(self.body)
+
+
+class Served:
+    """A server in a thread, which browsers and others ask."""
+
+    def __init__(self, root: Path) -> None:
+        self.server = ViewServer(root)
+        self.thread = threading.Thread(target=self.server.server.run, kwargs={"sockets": [self.server.listener]})
+        self.thread.start()
+
+    def ask(self, at: str = "state", way: str = "GET", whole: str | None = None, **headers: str) -> Answer:
+        """``at``: below the token; ``whole``: the whole path instead. Names of headers have _ for -."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.server.port, timeout=60)
+        connection.putrequest(way, whole or f"/{self.server.token}/{at}", skip_host=True, skip_accept_encoding=True)
+        given = {"Host": f"127.0.0.1:{self.server.port}"} | {k.replace("_", "-"): v for k, v in headers.items()}
+        for name, value in given.items():
+            connection.putheader(name, value)
+        connection.endheaders()
+        response = connection.getresponse()
+        answer = Answer(response.status, {k.lower(): v for k, v in response.getheaders()}, response.read())
+        connection.close()
+        return answer
+
+    def until(self, so: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
+        """What the state says once it says ``so``."""
+        ends = time.monotonic() + WAIT_SECONDS
+        while not so(told := self.ask().told):
+            assert time.monotonic() < ends, told
+            time.sleep(0.1)
+        return told
+
+    def close(self) -> None:
+        self.server.stop()
+        self.thread.join(30)
+
+
+@pytest.fixture(scope="module")
+def at_work(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TrainingAtWork]:
+    with TrainingAtWork(tmp_path_factory.mktemp("work")) as training:
+        yield training
+
+
+@pytest.fixture
+def served(at_work: TrainingAtWork) -> Iterator[Served]:
+    server = Served(at_work.root)
+    yield server
+    server.close()
+
+
+def parts_of(body: bytes) -> tuple[dict[str, Any], Callable[[str], bytes]]:
+    length = struct.unpack("<I", body[:4])[0]
+    header = json.loads(body[4 : 4 + length])
+    return header, lambda name: body[4 + length + header["sections"][name][0] :][: header["sections"][name][1]]
+
+
+def test_it_shows_the_field_of_a_training_at_work(served: Served) -> None:
+    told = served.until(lambda told: told["field"])
+    assert told["phase"] == "training" and 0 < told["progress"] < 1 and not told["finishing"]
+    header, section = parts_of(served.ask(f"field/{told['field']}").body)
+    field = header["field"]
+    rows = sum(level["rows"] for level in field["levels"])
+    assert field["bits"] == 16 and field["by_rows"] and len(section("table")) == 8 * rows
+    scene, _ = parts_of(served.ask("scene").body)
+    assert [v["name"] for v in scene["views"]][:6:2] == list(NAMES) and len(header["gains"]) == len(scene["views"])
+    later = served.until(lambda later: later["field"] != told["field"])
+    assert later["step"] > told["step"]
+    assert served.ask("field/no-such-field").status == 204
+
+
+def test_the_page_asks_nobody_else_and_holds_no_names(served: Served) -> None:
+    answer = served.ask("")
+    text = answer.body.decode()
+    assert answer.headers["content-type"].startswith("text/html") and "follow();" in text
+    assert "default-src 'none'" in text and "connect-src 'self'" in text
+    assert not re.search(r"https?://(?!www.w3.org/2000/svg)", text) and not any(name in text for name in NAMES)
+
+
+def test_every_answer_forbids_frames_caches_and_guessing(served: Served) -> None:
+    for answer in (served.ask(""), served.ask(), served.ask("scene"), served.ask(Host="evil.com")):
+        assert answer.headers["cache-control"] == "no-store" and answer.headers["x-frame-options"] == "DENY"
+        assert (
+            answer.headers["x-content-type-options"] == "nosniff" and answer.headers["referrer-policy"] == "no-referrer"
+        )
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.com", "evil.com:{port}", "127.0.0.1", "127.0.0.1:1", "127.0.0.1.evil.com:{port}", ""]
+)
+def test_a_foreign_host_is_refused(served: Served, host: str) -> None:
+    assert served.ask(Host=host.format(port=served.server.port)).status == 403
+    assert served.ask(Host=f"localhost:{served.server.port}").status == 200
+
+
+def test_a_page_of_another_origin_is_refused(served: Served) -> None:
+    own = f"http://127.0.0.1:{served.server.port}"
+    assert served.ask(Origin=own).status == 200
+    for origin in ("http://evil.com", "null", own.replace("http:", "https:"), own + "0"):
+        assert served.ask(Origin=origin).status == 403
+    for site in ("cross-site", "same-site"):
+        assert served.ask(Sec_Fetch_Site=site).status == 403
+    assert served.ask(Sec_Fetch_Site="same-origin").status == 200
+    assert served.ask("finish", "POST").status == 403, "whoever cannot say where he comes from"
+    assert served.ask("finish", "POST", Origin="http://evil.com").status == 403
+
+
+def test_nothing_but_the_pages_own_is_served(served: Served, at_work: TrainingAtWork) -> None:
+    token = served.server.token
+    (at_work.root / "secret.txt").write_text("secret")
+    paths = ["/", "/state", "/favicon.ico", f"/{token}", f"/{token}/../", f"/{token[:-1]}x/state", "/wrong/state"]
+    paths += [
+        f"/{token}/{up}{file}"
+        for up in ("../", "%2e%2e/", "..%2f", "field/../", "field/%2e%2e%2f")
+        for file in ("secret.txt", "run.json")
+    ]
+    paths += [
+        f"/{token}/field/..",
+        f"/{token}/field/%2fetc%2fpasswd",
+        f"/{token}/field/{LIVE}",
+        f"/{token}//etc/passwd",
+    ]
+    answers = {path: served.ask(whole=path) for path in paths}
+    assert {path: answer.status for path, answer in answers.items() if answer.status not in (204, 307, 404)} == {}
+    assert not any(b"secret" in answer.body or b"root:" in answer.body for answer in answers.values())
+    for way in ("PUT", "DELETE", "OPTIONS", "TRACE"):
+        assert served.ask("state", way).status in (405, 501)
+    assert (
+        served.ask("finish").status == 405
+        and served.ask("state", "POST", Origin=f"http://127.0.0.1:{served.server.port}").status == 405
+    )
+    assert not (at_work.partial / LIVE / FINISH).exists()
+
+
+def test_tokens_cannot_be_guessed(tmp_path: Path) -> None:
+    servers = [ViewServer(tmp_path) for _ in range(3)]
+    assert len({server.token for server in servers}) == 3 and all(len(server.token) == 32 for server in servers)
+    for server in servers:
+        server.listener.close()
+
+
+def test_no_other_address_of_this_machine_answers(served: Served) -> None:
+    address = can_reach_other_address()
+    if address is None:
+        pytest.skip("this machine has no address but its own loop's")
+    with pytest.raises(OSError):
+        socket.create_connection((address, served.server.port), timeout=5)
+
+
+def test_a_taken_port_is_refused() -> None:
+    taken = listening(None)
+    with refused("pipeline.view-port", taken.getsockname()[1]):
+        listening(taken.getsockname()[1])
+    taken.close()
+
+
+def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(view, "find_spec", lambda name: None if name == "uvicorn" else object())
+    with refused("pipeline.view-not-installed", "uvicorn", "pipeline-nerf[view]"):
+        view.check_installed()
+
+
+def test_two_servers_show_one_training_to_its_end(tmp_path: Path) -> None:
+    with TrainingAtWork(tmp_path) as training:
+        one, two = Served(training.root), Served(training.root)
+        for server in (one, two):
+            told = server.until(lambda told: told["field"] and told["step"] > 500)
+            assert server.ask(f"field/{told['field']}").status in (200, 204)
+        own = f"http://127.0.0.1:{two.server.port}"
+        assert two.ask("finish", "POST", Origin=own).told == {"asked": True}
+        one.until(lambda told: told.get("finishing") or told["phase"] == "finished")
+        training.wait()
+        for server in (one, two):
+            told = server.until(lambda told: told["phase"] == "finished")
+            assert told["field"] == "finished" and told["step"] == told["total_steps"] < 100_000
+            assert len(told["curve"]) > 2 and server.ask("field/finished").status == 200
+            server.close()
+        assert not (training.workspace.folder("train", KEYS["train"]) / LIVE).exists()
+
+
+def test_without_a_training_it_says_so(tmp_path: Path) -> None:
+    training = TrainingAtWork(tmp_path)
+    server = Served(training.root)
+    assert server.ask().told == {"phase": "stopped", "field": None}
+    assert server.ask("scene").status == 204
+    assert server.ask("finish", "POST", Origin=f"http://127.0.0.1:{server.server.port}").told == {"asked": False}
+    with training.workspace:
+        assert server.ask().told["phase"] == "waiting"
+    server.close()
+
+
+def test_ctrl_c_ends_the_command_and_leaves_the_training_alone(tmp_path: Path) -> None:
+    with TrainingAtWork(tmp_path) as training:
+        words = [sys.executable, "-m", "pipeline", "view", str(training.root), "--json"]
+        command = subprocess.Popen(
+            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=quiet_environment()
+        )
+        assert command.stdout is not None
+        port = int(re.findall(r":(\d+)/", json.loads(command.stdout.readline())["url"])[0])
+        ends = time.monotonic() + WAIT_SECONDS
+        while True:  # it answers
+            try:
+                socket.create_connection(("127.0.0.1", port), timeout=5).close()
+                break
+            except OSError:
+                assert time.monotonic() < ends
+        time.sleep(1)
+        command.send_signal(signal.SIGINT)
+        _, said = command.communicate(timeout=WAIT_SECONDS)
+        assert command.returncode == 130 and "Traceback" not in said
+        assert training.thread.is_alive(), training.error
+
+
+def test_a_server_beside_a_run_ends_with_it(tmp_path: Path) -> None:
+    lines = (
+        "import time",
+        "from pathlib import Path",
+        "from pipeline.view import beside",
+        f"with beside(Path({str(tmp_path)!r})) as url:",
+        "    print(url, flush=True)",
+        "    time.sleep(600)",
+    )
+    program = "\n".join(lines)
+    run = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert run.stdout is not None
+    port = int(re.findall(r":(\d+)/", run.stdout.readline())[0])
+    socket.create_connection(("127.0.0.1", port), timeout=30).close()
+    os.kill(run.pid, signal.SIGKILL)
+    run.wait()
+    ends = time.monotonic() + WAIT_SECONDS
+    with pytest.raises(OSError):
+        while time.monotonic() < ends:
+            socket.create_connection(("127.0.0.1", port), timeout=5).close()
+            time.sleep(0.2)

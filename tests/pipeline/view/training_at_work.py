@@ -1,0 +1,107 @@
+"""A workspace, made up, in which a thread trains a tiny field as stage train does it."""
+
+import os
+import threading
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from nerf.training.trainer import StepResult
+from pipeline.engine import manifests
+from pipeline.engine.manifests import Manifest
+from pipeline.engine.run_file import RunFile, write
+from pipeline.engine.workspace import Workspace
+from stages import train
+from stages.contract import StageResult, plan_stage
+from stages.io.files import write_json
+from stages.train import training
+from tests.conftest import SilentProgress
+from tests.stages.photo_scene import photographed
+from tests.stages.viewer.made_fields import NAMES
+
+KEYS = {name: f"{number:064x}" for number, name in enumerate(("ingest", "normalise", "effects", "scale", "train"), 1)}
+GRID: dict[str, Any] = {"num_levels": 2, "log2_hashmap_size": 10, "max_res": 32, "target_samples": 1024}
+MANY_STEPS = 1_000_000
+
+
+def manifest_of(stage: str, folder: Path, result: StageResult) -> Manifest:
+    """Of ``result`` in ``folder``."""
+    outputs, records = (manifests.describe_outputs(folder, names) for names in (result.outputs, result.records))
+    digest = manifests.outputs_digest(outputs)
+    return Manifest(stage, 1, KEYS[stage], {}, {}, outputs, digest, records, result.facts, "", 1.0, "")
+
+
+class Over(BaseException):
+    """The test is."""
+
+
+class TrainingAtWork:
+    """``root`` is its workspace, which it holds locked as a run does. Photos have names that break careless pages."""
+
+    def __init__(self, folder: Path, steps: int = MANY_STEPS, field: str = "grid") -> None:
+        self.root = folder / "w.nerf"
+        made, self.scene = photographed(folder / "made", channels=4)
+        content = self.scene.to_json()
+        for view, name in zip(content["views"][::2], NAMES, strict=False):
+            view["name"] = name
+        self.inputs = {name: self.root / name / KEYS[name][:16] for name in ("ingest", "normalise", "effects", "scale")}
+        for name, finished in self.inputs.items():
+            finished.parent.mkdir(parents=True)
+            made[name].rename(finished) if name in made else finished.mkdir()
+            manifests.write(finished, manifest_of(name, finished, StageResult((), "")))
+        write_json(self.inputs["normalise"] / "scene.json", content)
+        write_json(self.inputs["scale"] / "scale.json", {"metres_per_unit": None})
+        write(self.root, RunFile(keys=KEYS))
+        self.workspace, self.partial = Workspace(self.root), Workspace(self.root).partial("train", KEYS["train"])
+        sizes = {"grid": GRID} if field == "grid" else {"vanilla": {"depth": 2, "width": 16, "batch_rays": 64}}
+        self.config = train.Config(downscale=1.0, steps=steps, field=field, checkpoint_seconds=1e3, **sizes)  # pyright: ignore
+        self.thread = threading.Thread(target=self._train, daemon=True)
+        self.error: BaseException | None = None
+        self.over = False
+
+    def __enter__(self) -> "TrainingAtWork":
+        self.workspace.__enter__()
+        self.partial.mkdir(parents=True, exist_ok=True)
+        self.thread.start()
+        return self
+
+    def _train(self) -> None:
+        try:
+            config = plan_stage(train, self.config, self.inputs, SilentProgress())
+            loaded = training.load(config, self.inputs, self.partial, SilentProgress())
+            trainer, step = loaded.run.trainer, loaded.run.trainer.step
+
+            def step_unless_over(number: int, progress: float, lr_scale: float) -> StepResult:
+                if self.over:
+                    raise Over
+                return step(number, progress, lr_scale)
+
+            trainer.step = step_unless_over  # pyright: ignore[reportAttributeAccessIssue]
+            training.compute(loaded)
+            result = training.save(loaded, self.partial, SilentProgress())
+            manifest = manifest_of("train", self.partial, result)
+            self.workspace.finish(self.partial, self.workspace.folder("train", KEYS["train"]), manifest)
+        except BaseException as error:
+            self.error = error
+
+    def wait(self) -> None:
+        """Until it has ended."""
+        self.thread.join(120)
+        assert not self.thread.is_alive() and self.error is None, self.error
+
+    def __exit__(self, *_: object) -> None:
+        self.over = True
+        self.thread.join(120)
+        self.workspace.__exit__()
+
+
+def can_reach_other_address() -> str | None:
+    """An address of this machine other than those of the loop; None where there is none."""
+    addresses = [each.address for of in psutil.net_if_addrs().values() for each in of if each.family.name == "AF_INET"]
+    return next((address for address in addresses if not address.startswith("127.")), None)
+
+
+def quiet_environment() -> dict[str, str]:
+    """Without a screen: no browser opens."""
+    return {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
