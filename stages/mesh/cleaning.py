@@ -6,7 +6,15 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from stages.contract import StageError
-from stages.mesh.surface import Surface, border_vertices, components, face_areas, is_watertight, keep_faces
+from stages.mesh.surface import (
+    Surface,
+    border_indices,
+    border_vertices,
+    components,
+    face_areas,
+    is_watertight,
+    keep_faces,
+)
 from stages.mesh.visibility import Visibility
 
 if TYPE_CHECKING:
@@ -78,15 +86,31 @@ def clean(
 
 def _hidden(surface: Surface, visible: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Faces without a vertex within DILATION_STEPS edges of a ``visible`` one or near a sparse point, (faces,) bool;
-    none where there are too few points to tell, or where that would be all."""
-    if len(points) < MIN_POINTS:
-        return np.zeros(len(surface.faces), bool)
-    tree, radius = _point_tree(points)
-    supported = np.isfinite(tree.query(surface.vertices, distance_upper_bound=radius)[0])
+    none where that would be all.
+
+    Where there are too few points to tell (imported cameras have none), only such parts as end openly: the underside
+    of a ground that leaves the region of interest. The bare underside of an object closes it, and stays.
+    """
     for _ in range(DILATION_STEPS):
         visible = _dilated(surface.faces, visible)
-    hidden = ~(supported | visible)[surface.faces].all(1)
+    if len(points) < MIN_POINTS:
+        hidden = _ends_openly(surface, ~np.all(visible[surface.faces], axis=1))
+    else:
+        tree, radius = _point_tree(points)
+        supported = np.isfinite(tree.query(surface.vertices, distance_upper_bound=radius)[0])
+        hidden = ~(supported | visible)[surface.faces].all(1)
     return hidden & ~hidden.all()
+
+
+def _ends_openly(surface: Surface, marked: np.ndarray) -> np.ndarray:
+    """Those of the ``marked`` faces that hang together, by marked faces, with an open border of the surface."""
+    found = np.zeros(len(marked), bool)
+    if marked.any():
+        part, vertex = keep_faces(surface, marked)
+        label = components(part)
+        on_border = np.isin(vertex, border_indices(surface))[part.faces].any(1)
+        found[marked] = (np.bincount(label, on_border) > 0)[label]
+    return found
 
 
 def _dilated(faces: np.ndarray, marked: np.ndarray) -> np.ndarray:

@@ -92,10 +92,15 @@ def is_watertight(surface: Surface) -> bool:
 
 def border_vertices(surface: Surface) -> np.ndarray:
     """Positions of the ends of every edge that belongs to one face only, (2 × edges, 3)."""
+    return surface.vertices[border_indices(surface)]
+
+
+def border_indices(surface: Surface) -> np.ndarray:
+    """The ends of every edge that belongs to one face only, (2 × edges,)."""
     start, end = directed_edges(surface)
     size = len(surface.vertices)
     edge, count = np.unique(np.minimum(start, end) * size + np.maximum(start, end), return_counts=True)
-    return surface.vertices[np.concatenate(np.divmod(edge[count == 1], size))]
+    return np.concatenate(np.divmod(edge[count == 1], size))
 
 
 def directed_edges(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
@@ -110,6 +115,11 @@ def sample_surface(vertices: np.ndarray, faces: np.ndarray, count: int, seed: in
     Stratified along the cumulated area, so that ``count`` points cover a mesh evenly. Raises ValueError for a mesh
     without area.
     """
+    return sampled_faces(vertices, faces, count, seed)[0]
+
+
+def sampled_faces(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """The points of :func:`sample_surface`, and the face of each (count,)."""
     vertices = vertices.astype(np.float64)
     cumulated = np.cumsum(np.linalg.norm(face_area_vectors(vertices, faces), axis=-1))
     if len(faces) == 0 or not cumulated[-1] > 0:
@@ -119,4 +129,4 @@ def sample_surface(vertices: np.ndarray, faces: np.ndarray, count: int, seed: in
     chosen = np.searchsorted(cumulated, position, side="right").clip(max=len(faces) - 1)
     a, b, c = vertices[faces[chosen]].swapaxes(0, 1)
     root, fraction = np.sqrt(random[1])[:, None], random[2][:, None]
-    return (1 - root) * a + root * (1 - fraction) * b + root * fraction * c
+    return (1 - root) * a + root * (1 - fraction) * b + root * fraction * c, chosen

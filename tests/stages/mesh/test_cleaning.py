@@ -108,8 +108,24 @@ def test_hidden_surface_far_from_points_is_removed():
     assert clean(strip, view, np.concatenate([here, face]), "visible", 2, 0.0).hidden == cleaned.hidden - 1
     past_an_edge = Visibility(np.full(202, 50), np.where(x <= 20, 25, 9), np.zeros((202, 3)))
     assert clean(strip, past_an_edge, here, "visible", 2, 0.0).hidden == cleaned.hidden
-    assert clean(strip, view, here[: MIN_POINTS - 1], "visible", 2, 0.0).hidden == 0
+    assert clean(strip, view, here[: MIN_POINTS - 1], "visible", 2, 0.0).hidden == cleaned.hidden
     assert clean(strip, view, here, "all", 2, 0.0).hidden == 0
+
+
+@pytest.mark.parametrize(("opened", "hidden"), [(0, 0), (1, 6 * (60 - DILATION_STEPS))])
+def test_without_points_only_hidden_parts_that_end_openly_go(opened, hidden):
+    """A box of which photos see one end: the other closes it, unless it leaves the region there."""
+    line = np.arange(101.0)
+    ring = np.stack([np.stack([line, y + 0 * line, z + 0 * line], -1) for y, z in ((0, 0), (1, 0), (0.5, 1))], 1)
+    first = (3 * np.arange(100)[:, None, None] + np.arange(3)[:, None]).reshape(-1, 1)
+    after = np.tile([1, 1, -2], 100)[:, None]
+    none = 0 * after
+    quads = [np.hstack([none, after, none + 3]), np.hstack([after, after + 3, none + 3])]
+    sides = np.concatenate([first + corners for corners in quads])
+    caps = np.array([[0, 2, 1], [300, 301, 302]])[: 2 - opened]
+    tube = Surface(ring.reshape(-1, 3), np.concatenate([sides, caps]).astype(np.int32))
+    view = Visibility(np.full(303, 5), np.where(tube.vertices[:, 0] <= 40, 5, 1), np.zeros((303, 3)))
+    assert clean(tube, view, NO_POINTS, "visible", 2, 0.0).hidden == hidden
 
 
 def test_nothing_counts_as_hidden_where_all_would():
