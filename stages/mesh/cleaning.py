@@ -46,9 +46,16 @@ class Cleaned(NamedTuple):
 
 
 def clean(
-    surface: Surface, visibility: Visibility, points: np.ndarray, keep: "Keep", min_views: int, min_component: float
+    surface: Surface,
+    visibility: Visibility,
+    points: np.ndarray,
+    keep: "Keep",
+    min_views: int,
+    min_component: float,
+    has_alpha: bool = False,
 ) -> Cleaned:
-    """Remove what the photos do not support; ``points`` are the sparse ones (n, 3), in the frame of the surface.
+    """Remove what the photos do not support; ``points`` are the sparse ones (n, 3), in the frame of the surface;
+    ``has_alpha``: the photos' alpha says what is background.
 
     ``visible`` removes the faces that lie in fewer than ``min_views`` frustums (one photo gives no depth) and those
     visible in too few of them without a sparse point near (sky that hangs on the back of a table). Of the components it
@@ -66,7 +73,7 @@ def clean(
     hidden = 0
     if keep == "visible":
         visible = visibility.visible[old] >= np.maximum(min_views, MIN_VISIBLE_FRACTION * visibility.in_frustum[old])
-        remove = _hidden(surface, visible, points)
+        remove = _hidden(surface, visible, points, has_alpha)
         surface, left = keep_faces(surface, ~remove)
         old, hidden = old[left], int(remove.sum())
     label = components(surface)
@@ -84,17 +91,19 @@ def clean(
     return Cleaned(surface, old[left], int(good.sum()), int((~good).sum()), int((~inside).sum()), hidden)
 
 
-def _hidden(surface: Surface, visible: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _hidden(surface: Surface, visible: np.ndarray, points: np.ndarray, has_alpha: bool) -> np.ndarray:
     """Faces without a vertex within DILATION_STEPS edges of a ``visible`` one or near a sparse point, (faces,) bool;
     none where that would be all.
 
-    Where there are too few points to tell (imported cameras have none), only such parts as end openly: the underside
-    of a ground that leaves the region of interest. The bare underside of an object closes it, and stays.
+    Where there are too few points to tell (imported cameras have none), visibility alone decides; but of photos with
+    alpha only such parts go as end openly. Their silhouettes bound an object on all sides, so that its bare underside
+    closes it and stays. Without alpha the volume below a table is as the field happened to leave it.
     """
     for _ in range(DILATION_STEPS):
         visible = _dilated(surface.faces, visible)
     if len(points) < MIN_POINTS:
-        hidden = _ends_openly(surface, ~np.all(visible[surface.faces], axis=1))
+        hidden = ~np.all(visible[surface.faces], axis=1)
+        hidden = _ends_openly(surface, hidden) if has_alpha else hidden
     else:
         tree, radius = _point_tree(points)
         supported = np.isfinite(tree.query(surface.vertices, distance_upper_bound=radius)[0])

@@ -101,7 +101,9 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     visibility = vertex_visibility(raw.vertices, vertex_normals(raw), maps, voxel)
     progress.update("cleaning", 0.55)
     min_views = min(config.min_views, len(views))
-    cleaned = clean(raw, visibility, source.points, config.keep, min_views, config.min_component)
+    cleaned = clean(
+        raw, visibility, source.points, config.keep, min_views, config.min_component, source.scene.has_alpha
+    )
     surface = decimate(_cropped(config, cleaned.surface, source), config.max_faces)
     ends = boundary(surface, box, voxel)
     if config.close:

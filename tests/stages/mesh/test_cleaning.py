@@ -46,7 +46,7 @@ def long_strip():
 def test_visible_keeps_what_is_seen_and_large_enough():
     surface = tetrahedra(1.0, 0.5, 0.05, 1.0)  # the third is a speck of 1/400 of the area, the last an unseen cavity
     cleaned = clean(surface, visibility_of([5, 5, 5, 5], [3, 2, 5, 1]), NO_POINTS, "visible", 2, 0.01)
-    assert (cleaned.kept, cleaned.dropped, cleaned.outside) == (2, 2, 0)
+    assert (cleaned.kept, cleaned.dropped, cleaned.outside, cleaned.hidden) == (2, 1, 0, 4)
     np.testing.assert_array_equal(cleaned.surface.vertices, surface.vertices[:8])
     assert cleaned.vertex.tolist() == list(range(8))
 
@@ -112,9 +112,13 @@ def test_hidden_surface_far_from_points_is_removed():
     assert clean(strip, view, here, "all", 2, 0.0).hidden == 0
 
 
-@pytest.mark.parametrize(("opened", "hidden"), [(0, 0), (1, 6 * (60 - DILATION_STEPS))])
-def test_without_points_only_hidden_parts_that_end_openly_go(opened, hidden):
-    """A box of which photos see one end: the other closes it, unless it leaves the region there."""
+@pytest.mark.parametrize(
+    ("has_alpha", "opened", "hidden"),
+    [(True, 0, 0), (True, 1, 6 * (60 - DILATION_STEPS)), (False, 0, 6 * (60 - DILATION_STEPS) + 1)],
+)
+def test_without_points_silhouettes_keep_a_hidden_end(has_alpha, opened, hidden):
+    """A box of which photos see one end: the other closes it, unless it leaves the region there or nothing bounds
+    it."""
     line = np.arange(101.0)
     ring = np.stack([np.stack([line, y + 0 * line, z + 0 * line], -1) for y, z in ((0, 0), (1, 0), (0.5, 1))], 1)
     first = (3 * np.arange(100)[:, None, None] + np.arange(3)[:, None]).reshape(-1, 1)
@@ -125,7 +129,7 @@ def test_without_points_only_hidden_parts_that_end_openly_go(opened, hidden):
     caps = np.array([[0, 2, 1], [300, 301, 302]])[: 2 - opened]
     tube = Surface(ring.reshape(-1, 3), np.concatenate([sides, caps]).astype(np.int32))
     view = Visibility(np.full(303, 5), np.where(tube.vertices[:, 0] <= 40, 5, 1), np.zeros((303, 3)))
-    assert clean(tube, view, NO_POINTS, "visible", 2, 0.0).hidden == hidden
+    assert clean(tube, view, NO_POINTS, "visible", 2, 0.0, has_alpha).hidden == hidden
 
 
 def test_nothing_counts_as_hidden_where_all_would():
