@@ -22,6 +22,7 @@ from stages.io.files import sync_file, sync_folder, write_durably
 
 RUN_FILE = run_file.NAME
 COPIES = ".copies"  # what in output/ is no link but a copy, one a line: its name, a tab, what of the workspace it shows
+LOCK_SECONDS = 0.5  # to wait for the lock: `status` and `view` hold it for an instant, to see whether anybody works
 _KEY = re.compile(rf"[0-9a-f]{{{KEY_LENGTH}}}(\.|$)")
 
 
@@ -72,7 +73,7 @@ class Workspace:
             names = [name for module in STAGES.values() for name in module.PUBLISHED]
             self._adopt_copies(names)
             self._refuse_strangers(names)
-            self._lock.acquire(timeout=0)
+            self._lock.acquire(timeout=LOCK_SECONDS)
             (self.root / ".lock.pid").write_text(f"{os.getpid()}\n")
         except Timeout:
             why = f"process {self._holder()} holds its lock"
