@@ -218,7 +218,7 @@ def test_the_current_folder_holds_no_modules(tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_server_that_says_nothing_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(view, "COMMAND", ["-c", "import time; time.sleep(60)"])
+    monkeypatch.setattr(view, "COMMAND", ["-c", """import time; time.sleep(3); print('{"url": "late"}')"""])
     monkeypatch.setattr(view, "START_SECONDS", 0.5)
     with refused("pipeline.view-ended", "0 s"), view.serve_during(tmp_path):
         pass
