@@ -33,10 +33,10 @@ from stages.sfm.colmap.database import (
 from stages.sfm.colmap.mapping import MAPPING_MODEL
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import Checked, camera_poses, check_model
-from stages.sfm.geometry_check import CONTRADICTION_FACTOR, check_poses
 from stages.sfm.pairs.image_retrieval import CELLS
 from stages.sfm.pairs.match_graph import connected, natural_order, pairs_apart
 from stages.sfm.pairs.pair_selection import nearest, union
+from stages.sfm.pose_check import CONTRADICTION_FACTOR, check_poses
 
 SIZES = (1, 1, 1, 2, 3, 5, 10, 20)
 

@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 from pipeline.engine.workspace import RUN_FILE
 from stages.contract import StageError
-from stages.ingest.listing import IMAGES, is_video, photo_root
+from stages.ingest.listing import IMAGES, is_video
+from stages.ingest.sources import photo_root
 
 
 class Scene(NamedTuple):
@@ -46,8 +47,8 @@ def _is_ours(folder: Path) -> bool:
 
 def _sign_of_one_scene(folder: Path, found: list[Path]) -> str | None:
     """What tells that the folder is the photos of one scene; None where nothing does."""
-    if photo_root(folder) != folder:
-        return "it has a folder named images"
+    if (photos := photo_root(folder)) != folder:
+        return f"its photos are in {photos.name}"
     for path in found:
         if path.name.startswith("transforms") and path.suffix == ".json":
             return f"{path.name} lies in it"

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float, Int
 
-from stages.sfm.geometry_check import MIN_PAIR_MATCHES, PairMatches
+from stages.sfm.pose_check import MIN_PAIR_MATCHES, PairMatches
 
 MAX_MATCHES_CHECKED = 200  # of a pair, drawn by the seed: their median is known to a tenth of their spread
 

@@ -1,6 +1,6 @@
 """Images whose poses contradict their matches: deregistered, registered again, left out if that does not help.
 
-Call it in a worker process. stages/sfm/geometry_check.py decides what contradicts a pose.
+Call it in a worker process. stages/sfm/pose_check.py decides what contradicts a pose.
 """
 
 import shutil
@@ -18,7 +18,8 @@ from stages.sfm.colmap.correspondences import read_pair_matches
 from stages.sfm.colmap.database import copy_without_pairs, finish_copy, keep_inliers, unfinished_copy
 from stages.sfm.colmap.mapping import map_incrementally
 from stages.sfm.colmap.models import load_native, write_native
-from stages.sfm.geometry_check import (
+from stages.sfm.pairs.match_graph import ORDER_OVERLAP, connected
+from stages.sfm.pose_check import (
     PairMatches,
     PoseCheck,
     check_poses,
@@ -30,7 +31,6 @@ from stages.sfm.geometry_check import (
     supported_pairs,
     weak_links,
 )
-from stages.sfm.pairs.match_graph import ORDER_OVERLAP, connected
 
 
 class Checked(NamedTuple):

@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from stages.io.transforms_export import OPENGL_FROM_OPENCV
-from stages.sfm.geometry_check import PairMatches, agreement
 from stages.sfm.pairs.match_graph import connected
+from stages.sfm.pose_check import PairMatches, agreement
 
 AXES: dict[str, Float[np.ndarray, "3 3"]] = {"opencv": np.eye(3), "opengl": OPENGL_FROM_OPENCV}
 # Of OpenCV's x, y and z, and their opposites.

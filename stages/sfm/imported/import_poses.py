@@ -11,6 +11,7 @@ from stages.contract import Progress, StageError, listed
 from stages.io.photos import Photo, read_frame_names
 from stages.io.sparse_model import SparseModel
 from stages.sfm.colmap.models import read_model, write_model
+from stages.sfm.imported.check_worker import check_imported_poses
 from stages.sfm.imported.conventions import (
     AXES,
     Fit,
@@ -20,7 +21,6 @@ from stages.sfm.imported.conventions import (
     found_convention,
     named_axes,
 )
-from stages.sfm.imported.pose_check import check_imported_poses
 from stages.sfm.imported.pose_files import ImportedPoses, convention_of_format, read_poses
 
 MAX_NAMES = 5

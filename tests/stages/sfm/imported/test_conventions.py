@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerf.synthetic.scenes import ring_of_cameras
-from stages.sfm.geometry_check import PairMatches, check_poses
 from stages.sfm.imported.conventions import (
     AXES,
     LEFT_HANDED,
@@ -24,6 +23,7 @@ from stages.sfm.imported.conventions import (
     named_axes,
     world_from_camera,
 )
+from stages.sfm.pose_check import PairMatches, check_poses
 
 PHOTOS, FOCAL_PX = 12, 800.0
 DIRECTIONS = ("world-from-camera", "camera-from-world")

@@ -1,7 +1,7 @@
 """Whether imported poses fit their photos, in a child process: COLMAP may abort.
 
-Features of reduced photos are matched between neighbours by pose, which the check of stages/sfm/geometry_check.py
-judges. ``python -P -m stages.sfm.imported.pose_check`` reads a job from stdin as one line of JSON and answers with
+Features of reduced photos are matched between neighbours by pose, which the check of stages/sfm/pose_check.py
+judges. ``python -P -m stages.sfm.imported.check_worker`` reads a job from stdin as one line of JSON and answers with
 another.
 """
 
@@ -36,7 +36,7 @@ from stages.sfm.pairs.match_graph import MIN_INLIERS, natural_order, pairs_apart
 from stages.sfm.pairs.pair_selection import Pairs, closeness, nearest, union
 from stages.sfm.worker_process import environment
 
-COMMAND = ["-P", "-m", "stages.sfm.imported.pose_check"]
+COMMAND = ["-P", "-m", "stages.sfm.imported.check_worker"]
 MAX_IMAGE_SIZE, MAX_FEATURES = 1000, 2000  # enough to tell a step of a few pixels, in seconds for hundreds of photos
 PARTNERS = 6  # of each photo
 MAX_NAME_STEPS = 2  # positions before and after it, in the order of names

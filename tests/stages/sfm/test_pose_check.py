@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stages.sfm.geometry_check import (
+from stages.sfm.pose_check import (
     CONTRADICTION_FACTOR,
     MIN_PAIR_MATCHES,
     PairMatches,
