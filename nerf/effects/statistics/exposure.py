@@ -167,7 +167,7 @@ def exposure_statistic(
     The noise, that of one usual gain, is beside it; what all gains have is taken off in quadrature, so that noise alone
     is no difference. Photos whose noise is an effect itself do not count, for a few would hide the others' gains, or
     pass for a difference; nor do ``odd`` ones, in which something stands before many of their points
-    (nerf/effects/statistics/transients.py) and draws their gains. ``told`` is what the camera wrote of each photo's
+    (nerf/effects/statistics/outlier_images.py) and draws their gains. ``told`` is what the camera wrote of each photo's
     exposure (EV up to a constant, NaN where nothing): a cross-check, which decides nothing because programs that
     develop photos change exposures and leave what was written.
     """
