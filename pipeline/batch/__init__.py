@@ -3,6 +3,7 @@
 What is known of the scenes is in batch.json, written before and after each run; the same command goes on from there.
 """
 
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,20 +15,23 @@ from pipeline.batch import batch_file
 from pipeline.batch.batch_file import BatchFile, SceneFailure, SceneState
 from pipeline.batch.page import PAGE, write_page
 from pipeline.batch.scene_run import figures_of, run_scene
-from pipeline.batch.scenes import Scene
+from pipeline.batch.scenes import Scene, printable
 from pipeline.engine.display import Display
 from stages.contract import StageError
 from stages.io.amounts import duration
 
+MIN_SECONDS = 1.0  # of the budget, for a scene to be begun
+
 
 @dataclass(frozen=True)
 class Batch:
-    """Scenes and where their workspaces go: ``folder``/NAME.nerf, NAME.log beside it. ``words`` are the options of each
-    run; ``budget`` is seconds for all runs, None without a limit."""
+    """Scenes of the folder ``of``, and where their workspaces go: ``folder``/NAME.nerf, NAME.log beside it. Each run is
+    given the ``options``; ``budget`` is seconds for all runs, None without a limit."""
 
+    of: Path
     scenes: Sequence[Scene]
     folder: Path
-    words: Sequence[str]
+    options: Sequence[str]
     budget: float | None
 
     def workspace(self, name: str) -> Path:
@@ -37,22 +41,33 @@ class Batch:
         return self.folder / f"{name}.log"
 
 
+def check_same_folder(folder: Path, scenes: Path) -> str | None:
+    """The other folder of scenes, still there, that the batch in ``folder`` was made from; None where there is none."""
+    before = batch_file.read(folder).folder
+    same = not before or not os.path.isdir(before) or os.path.realpath(before) == os.path.realpath(scenes)
+    return None if same else before
+
+
 def run_batch(batch: Batch, display: Display) -> int:
     """Run every scene; the number of those that failed. Raises StageError where another batch works in its folder, or
     nothing can be written there."""
     try:
         batch.folder.mkdir(parents=True, exist_ok=True)
-        with FileLock(batch.folder / ".lock", timeout=0):
-            return _run_all(batch, display)
+        lock = FileLock(batch.folder / ".lock").acquire(timeout=0)
     except Timeout:
         hint = "Wait for it to end, or give another folder with -o."
-        raise StageError(
-            "pipeline.batch-in-use", f"{batch.folder} is in use", "another batch runs there", hint
-        ) from None
+        what, why = f"{batch.folder} is in use", "another batch runs there"
+        raise StageError("pipeline.batch-in-use", what, why, hint) from None
     except OSError as error:
-        hint = "Make room there, or give a writable folder with -o."
-        why = error.strerror or str(error)
-        raise StageError("pipeline.batch-cannot-write", f"cannot write to {batch.folder}", why, hint) from error
+        raise _cannot_write(batch, error) from error
+    with lock:
+        return _run_all(batch, display)
+
+
+def _cannot_write(batch: Batch, error: OSError) -> StageError:
+    hint = "Make room there, or give a writable folder with -o."
+    why = error.strerror or str(error)
+    return StageError("pipeline.batch-cannot-write", f"cannot write to {batch.folder}", why, hint)
 
 
 def _run_all(batch: Batch, display: Display) -> int:
@@ -63,50 +78,69 @@ def _run_all(batch: Batch, display: Display) -> int:
         _run_one(batch, state, scene, display)
     failed = [name for name, scene in state.scenes.items() if scene.state == "failed"]
     done = len(state.scenes) - len(failed)
-    words = f"{done} of {len(state.scenes)} scenes are done" + (f"; failed: {', '.join(failed)}" if failed else "")
-    display.finished(f"{words} → {batch.folder / PAGE}", {PAGE: batch.folder / PAGE})
+    text = f"{done} of {len(state.scenes)} scenes are done" + (f"; failed: {', '.join(failed)}" if failed else "")
+    display.finished(f"{text} → {batch.folder / PAGE}", {PAGE: batch.folder / PAGE})
     return len(failed)
 
 
 def _continued(batch: Batch, before: BatchFile) -> BatchFile:
-    """How the scenes stand at the start: as they were left where the same was asked for, but that failed ones wait."""
-    same = (before.words, before.budget) == (list(batch.words), batch.budget)
+    """How the scenes stand at the start: as they were left, but that failed ones wait."""
     scenes = dict[str, SceneState]()
     for scene in batch.scenes:
-        known, photos = before.scenes.get(scene.name) if same else None, str(scene.photos.absolute())
-        scenes[scene.name] = known if known is not None and known.photos == photos else SceneState(photos=photos)
-        if scenes[scene.name].state == "failed":
-            scenes[scene.name] = SceneState(photos=photos, spent=scenes[scene.name].spent)
-    return BatchFile(words=list(batch.words), budget=batch.budget, scenes=scenes)
+        known, photos = before.scenes.get(scene.name), printable(os.path.abspath(scene.photos))
+        if known is None or known.photos != photos:
+            scenes[scene.name] = SceneState(photos=photos)
+        elif known.state == "failed":
+            scenes[scene.name] = SceneState(photos=photos, spent=known.spent)
+        else:
+            scenes[scene.name] = known
+    return BatchFile(folder=printable(os.path.abspath(batch.of)), budget=batch.budget, scenes=scenes)
 
 
 def _run_one(batch: Batch, state: BatchFile, scene: Scene, display: Display) -> None:
     own = state.scenes[scene.name]
-    own.share, own.state = state.share(scene.name), "running"
-    _write(batch, state)
-    limit = () if own.share is None else ("--budget", f"{own.share:.0f}s")
-    words = (str(scene.photos), "-o", str(batch.workspace(scene.name)), *batch.words, *limit)
-    began, spent = time.monotonic(), own.spent
+    own.allocated, own.state = state.allocated(scene.name), "running"
     display.begin(scene.name)
-    try:
-        last, own.failure = run_scene(words, batch.log(scene.name), display.update)
-    finally:
-        seconds = time.monotonic() - began
-        own.spent = round(spent + seconds, 1)
+    began, spent, last = time.monotonic(), own.spent, ""
+    if own.allocated is not None and own.allocated < MIN_SECONDS:
+        what, why = "not begun", "the other scenes have used up the budget"
+        hint = "Give the same command with a larger --budget: finished scenes are kept."
+        own.failure = SceneFailure(stage=None, code="pipeline.no-time-left", what=what, why=why, hint=hint)
+        own.allocated = None
+    else:
         _write(batch, state)
+        try:
+            last, own.failure = _run(batch, scene, own.allocated, display)
+        finally:
+            own.spent = round(spent + time.monotonic() - began, 1)
+            _write(batch, state)
     own.state = "failed" if own.failure else "done"
     if own.failure:
         display.failed(scene.name, _as_error(own.failure))
     else:
         own.figures = figures_of(batch.workspace(scene.name))
         own.line = _line(own) or last
-        display.end(scene.name, own.line, seconds, cached=False)
+        display.end(scene.name, own.line, time.monotonic() - began, cached=False)
     _write(batch, state)
 
 
+def _run(batch: Batch, scene: Scene, seconds: float | None, display: Display) -> tuple[str, SceneFailure | None]:
+    limit = () if seconds is None else ("--budget", f"{seconds:.0f}s")
+    arguments = (str(scene.photos), *batch.options, *limit, "-o", str(batch.workspace(scene.name)))
+    try:
+        return run_scene(arguments, batch.log(scene.name), display.update)
+    except OSError as error:
+        hint = "Give the same command again; what is finished is kept."
+        why = error.strerror or str(error)
+        return "", SceneFailure(stage=None, code="pipeline.scene-not-run", what="cannot run it", why=why, hint=hint)
+
+
 def _write(batch: Batch, state: BatchFile) -> None:
-    batch_file.write(batch.folder, state)
-    write_page(batch.folder, state)
+    try:
+        batch_file.write(batch.folder, state)
+        write_page(batch.folder, state)
+    except OSError as error:
+        raise _cannot_write(batch, error) from error
 
 
 def _as_error(failure: SceneFailure) -> StageError:

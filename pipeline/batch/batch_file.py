@@ -9,7 +9,6 @@ from stages.contract import StageError
 from stages.io.files import first_fault, write_durably
 
 NAME = "batch.json"
-VERSION = 1
 
 
 class SceneFailure(BaseModel):
@@ -25,44 +24,42 @@ class SceneFailure(BaseModel):
 
 
 class SceneState(BaseModel):
-    """How one scene stands. ``share`` of the batch's budget and ``spent`` by all its runs are seconds; ``line`` tells
-    the result in short; ``figures`` are those of its summary.json that rank it."""
+    """How one scene stands. ``allocated`` of the batch's budget and ``spent`` by all its runs are seconds; ``line``
+    tells the result in short; ``figures`` are those of its summary.json that rank it."""
 
     model_config = ConfigDict(extra="forbid")
 
     photos: str
     state: Literal["waiting", "running", "done", "failed"] = "waiting"
-    share: float | None = None
+    allocated: float | None = None
     spent: float = 0.0
     line: str = ""
-    figures: dict[str, float | int | bool | str | None] = {}
+    figures: dict[str, float | int | bool | None] = {}
     failure: SceneFailure | None = None
 
 
 class BatchFile(BaseModel):
-    """``words``: the options that every run is given; ``budget``: seconds for all of them, None without a limit."""
+    """``folder``: of the scenes; ``budget``: seconds for all of them, None without a limit."""
 
     model_config = ConfigDict(extra="forbid")
 
-    version: int = VERSION
-    words: list[str] = []
+    version: Literal[1] = 1
+    folder: str = ""
     budget: float | None = None
     scenes: dict[str, SceneState] = {}
 
-    def share(self, name: str) -> float | None:
+    def allocated(self, name: str) -> float | None:
         """Seconds of the budget for a scene; None without one.
 
-        Scenes that wait share what the others leave. A scene that was interrupted or is done keeps its share, for
-        another one would choose other settings; one that failed before is given an even part of the whole."""
-        scene = self.scenes[name]
-        if self.budget is None or scene.share is not None:
-            return scene.share
-        if scene.spent:
-            return self.budget / len(self.scenes)
+        Scenes that wait share what the others leave, which may be nothing. One that was interrupted or is done keeps
+        what it was given, for with another budget it would choose other settings."""
+        if self.budget is None:
+            return None
+        if (given := self.scenes[name].allocated) is not None:
+            return given
         others = self.scenes.values()
-        used = sum(max(s.share or 0.0, s.spent) if s.state == "running" else s.spent for s in others)
-        waiting = sum(s.share is None and not s.spent for s in others)
-        return max(1.0, (self.budget - used) / waiting)
+        used = sum(max(one.allocated or 0.0, one.spent) if one.state == "running" else one.spent for one in others)
+        return (self.budget - used) / sum(one.allocated is None for one in others)
 
 
 def read(folder: Path) -> BatchFile:

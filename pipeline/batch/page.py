@@ -2,6 +2,8 @@
 
 import base64
 import io
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -53,11 +55,18 @@ def _entry(folder: Path, name: str, scene: SceneState) -> dict[str, Any]:
 
 
 def _picture(renders: Path) -> str | None:
-    """A small render of a test photo as a data URI; None where there is none."""
-    for file in sorted(renders.glob("*.png"))[:1]:
-        with Image.open(file) as image:
-            image.thumbnail((PICTURE_PX, PICTURE_PX))
-            small = io.BytesIO()
-            image.convert("RGB").save(small, "JPEG", quality=85)
-        return f"data:image/jpeg;base64,{base64.b64encode(small.getvalue()).decode()}"
+    """A small render of a test photo as a data URI; None where there is none that can be read."""
+    with suppress(OSError):
+        for file in sorted(renders.glob("*.png"))[:1]:
+            return _shrunk(file, file.stat().st_mtime_ns)
     return None
+
+
+@cache
+def _shrunk(file: Path, changed_ns: int) -> str:
+    """``changed_ns`` tells a new picture under an old name; the page is written twice for each scene."""
+    with Image.open(file) as image:
+        image.thumbnail((PICTURE_PX, PICTURE_PX))
+        small = io.BytesIO()
+        image.convert("RGB").save(small, "JPEG", quality=85)
+    return f"data:image/jpeg;base64,{base64.b64encode(small.getvalue()).decode()}"

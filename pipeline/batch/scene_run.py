@@ -14,45 +14,52 @@ from pipeline.batch.batch_file import SceneFailure
 from stages.hardware.child_process import child_environment
 
 COMMAND = ["-P", "-m", "pipeline.cli.attended", "run"]  # -P: nothing in the current folder is taken for a module
-FIGURES = ("photos", "registered", "psnr", "ssim", "cameras_doubtful", "verdict")
+NO_REASON = {"why": "an option is wrong", "hint": "Correct it, and give the command again."}  # of a usage error
+FIGURES = ("photos", "registered", "psnr", "ssim", "cameras_doubtful")
 
 
 def run_scene(
-    words: Sequence[str], log: Path, follow: Callable[[str, float | None], None]
+    arguments: Sequence[str], log: Path, follow: Callable[[str, float | None], None]
 ) -> tuple[str, SceneFailure | None]:
-    """Run `pipeline run` with ``words``; the last line of its output, and why it failed (None: it did not).
+    """Run `pipeline run` with ``arguments``; its last finished stage in a line, and why it failed (None: it did not).
 
-    What it says goes to ``log``; ``follow`` gets its live line and the finished share of the stage. Where this process
-    is interrupted, the run is, too, and has ended when the exception goes on."""
+    What it says goes to ``log``; ``follow`` gets its live line and the finished fraction of the stage. Where this
+    process is interrupted, the run is, too, and has ended when the exception goes on."""
     last, failure = "", None
-    with log.open("a", encoding="utf-8") as text, _started(words, text) as child:
-        assert child.stdout
-        for event in map(json.loads, child.stdout):
-            if event["event"] == "progress":
-                follow(f"{event['stage']} · {event['message']}", event["done"])
-                continue
-            if event["event"] == "begin":
-                follow(event["stage"], None)
-            elif event["event"] == "end":
-                last = f"{event['stage']}: {event['line']}"
-            elif event["event"] == "error":
-                failure = SceneFailure(**{key: event[key] for key in SceneFailure.model_fields})
-            text.write(_in_words(event))
-            text.flush()
+    with log.open("a", encoding="utf-8", errors="backslashreplace") as text:
+        text.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} pipeline run {' '.join(arguments)}\n")
+        text.flush()
+        began = text.tell()
+        with _started(arguments, text) as child:
+            assert child.stdout
+            for event in map(_event, child.stdout):
+                if event["event"] == "progress":
+                    follow(f"{event['stage']} · {event['message']}", event["done"])
+                    continue
+                if event["event"] == "begin":
+                    follow(event["stage"], None)
+                elif event["event"] == "end":
+                    last = f"{event['stage']}: {event['line']}"
+                elif event["event"] == "error":
+                    told = {key: event[key] for key in SceneFailure.model_fields}
+                    failure = SceneFailure(**told if event["why"] else told | NO_REASON)
+                text.write(_log_line(event))
+                text.flush()
     if child.returncode and failure is None:
-        failure = _crash(log, child.returncode)
+        failure = _crash(log, began, child.returncode)
     return last, failure
 
 
 @contextmanager
-def _started(words: Sequence[str], log: IO[str]) -> Iterator["subprocess.Popen[str]"]:
+def _started(arguments: Sequence[str], log: IO[str]) -> Iterator["subprocess.Popen[str]"]:
     child = subprocess.Popen(
-        [sys.executable, *COMMAND, *words, "--json"],
+        [sys.executable, *COMMAND, *arguments, "--json"],
         stdin=subprocess.PIPE,  # open as long as this process lives
         stdout=subprocess.PIPE,
         stderr=log,
         env=child_environment(),
         encoding="utf-8",
+        errors="replace",
         start_new_session=True,  # Ctrl-C reaches this process alone, which hands it on
     )
     try:
@@ -67,25 +74,33 @@ def _started(words: Sequence[str], log: IO[str]) -> Iterator["subprocess.Popen[s
                 stream.close()
 
 
-def _in_words(event: Mapping[str, Any]) -> str:
+def _event(line: str) -> dict[str, Any]:
+    """A line of the run's output; one that is no event, such as a library prints, or that a crash cut off, as a
+    message."""
+    try:
+        event = json.loads(line)
+        return event if "event" in event else {"event": "note", "message": line.strip()}
+    except (ValueError, TypeError):
+        return {"event": "note", "message": line.strip()}
+
+
+def _log_line(event: Mapping[str, Any]) -> str:
     kind = event["event"]
     if kind == "begin":
         return f"{time.strftime('%H:%M:%S')} {event['stage']}\n"
     if kind == "error":
         return f"failed: {event['what']}\n  why: {event['why']}\n  try: {event['hint']}\n"
-    words = event.get("line") or event.get("message") or event.get("text") or ""
-    return f"         {words}\n"
+    return f"         {event.get('line') or event.get('message') or event.get('text') or ''}\n"
 
 
-def _crash(log: Path, ending: int) -> SceneFailure:
-    lines = log.read_text("utf-8", "replace").strip().splitlines()
-    what = (
-        f"its process was ended by {signal.Signals(-ending).name}"
-        if ending < 0
-        else f"its process ended with code {ending}"
-    )
+def _crash(log: Path, began: int, ending: int) -> SceneFailure:
+    """The failure of a run that ended without an error of its own, whose part of the log begins at ``began``."""
+    with log.open("rb") as file:
+        file.seek(began)
+        lines = file.read().decode("utf-8", "replace").strip().splitlines()
+    what = f"its process ended {f'by {signal.Signals(-ending).name}' if ending < 0 else f'with code {ending}'}"
     memory = ending == -getattr(signal, "SIGKILL", 9)
-    why = "most likely memory ran out" if memory else f"its last words: {lines[-1].strip() if lines else 'none'}"
+    why = "most likely memory ran out" if memory else f"its last line: {lines[-1].strip() if lines else 'none'}"
     hint = f"Give the same command again: what is finished is kept. Log: {log}"
     return SceneFailure(stage=None, code="pipeline.scene-crashed", what=what, why=why, hint=hint)
 

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import shutil
 import sys
 import time
@@ -156,12 +157,7 @@ def command_run(words: Sequence[str]) -> int:
     if given.from_ is not None:
         force = frozenset(stages[stages.index(_known_stage(given.from_, "--from", stages)) :])
     budget = _budget(given.budget, asked)
-    if budget is not None and (studies := [stage for stage in stages if stage_list.is_on_request(stage)]):
-        stage = studies[0]
-        what = f"no budget covers {stage}, which has its own time limit (--{stage}.seconds)"
-        if stage != given.until:
-            raise UsageError(f"--budget and --train.depth: {what}; give --train.seconds in place of --budget")
-        raise UsageError(f"--budget and --until {stage}: {what}; run first, then `pipeline {stage} {root}`")
+    _check_budget(budget, stages, given.until, root)
     with choose_display(given.common.json) as display:
         try:
             asked = with_source(asked, given.photos, cameras)
@@ -184,26 +180,40 @@ def command_batch(words: Sequence[str]) -> int:
         settings = arguments.with_flags(file, settings, "batch", words)
     settings = with_effects(settings, given.effect)
     budget = _budget(given.budget, settings)
-    _known_stage(given.until or list(stage_list.STAGES)[-1], "--until")
-    from pipeline.batch import Batch, run_batch
+    last = _known_stage(given.until or list(stage_list.STAGES)[-1], "--until")
+    _check_budget(budget, stage_list.up_to(last, dict(settings)), given.until, "WORKSPACE")
+    check_fitted_poses(settings)
+    from pipeline.batch import Batch, check_same_folder, run_batch
     from pipeline.batch.scenes import find_scenes
 
     folder = given.output or Path.cwd() / f"{given.scenes.absolute().name}.batch"
-    batch = Batch(find_scenes(given.scenes), folder, _words_of_each(words[1:]), budget)
+    if given.output is None and (other := check_same_folder(folder, given.scenes)):
+        raise UsageError(f"{folder.name} was made from {other}, not from {given.scenes}; give another folder with -o")
+    batch = Batch(given.scenes, find_scenes(given.scenes), folder, _options_of_each(words[1:]), budget)
     with choose_display(given.common.json) as display:
         return exit_codes.BATCH if run_batch(batch, display) else 0
 
 
-def _words_of_each(words: Sequence[str]) -> list[str]:
-    """The words of a batch's command line that each of its runs is given: not those that are the batch's own."""
+def _options_of_each(words: Sequence[str]) -> list[str]:
+    """The options of a batch's command line that each of its runs is given: not those that are the batch's own."""
     own, each = ("-o", "--output", "--budget"), list[str]()
     rest = iter(words)
     for word in rest:
         if word in own:
             next(rest, None)
-        elif word != "--json" and word.partition("=")[0] not in own:
+        elif word != "--json" and word.partition("=")[0] not in own and not re.match("-o[^-]", word):
             each.append(word)
     return each
+
+
+def _check_budget(budget: float | None, stages: Sequence[str], until: str | None, root: Path | str) -> None:
+    """Raises UsageError where a ``budget`` is given for ``stages`` that none covers."""
+    if budget is not None and (studies := [stage for stage in stages if stage_list.is_on_request(stage)]):
+        stage = studies[0]
+        what = f"no budget covers {stage}, which has its own time limit (--{stage}.seconds)"
+        if stage != until:
+            raise UsageError(f"--budget and --train.depth: {what}; give --train.seconds in place of --budget")
+        raise UsageError(f"--budget and --until {stage}: {what}; run first, then `pipeline {stage} {root}`")
 
 
 def _keeping_studies(settings: Settings, root: Path, words: Sequence[str], file: Collection[str] = ()) -> Settings:

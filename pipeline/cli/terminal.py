@@ -152,7 +152,7 @@ class RichDisplay:
         self._console = Console(highlight=False)
         self.progress = Progress(
             SpinnerColumn(),
-            TextColumn("{task.fields[stage]:<10}"),
+            TextColumn("{task.fields[stage]:<10}", markup=False),
             BarColumn(bar_width=20),
             TextColumn("{task.description}"),
             TimeElapsedColumn(),

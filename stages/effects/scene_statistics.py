@@ -163,7 +163,7 @@ def unless_pixels_differ(exposure: Statistic, scale: Statistic) -> Statistic:
     apart, by which the gains of photos from very different distances differ, too (docs/experiments/effects.md)."""
     if not (exposure.called_for and scale.called_for):
         return exposure
-    words = f"{exposure.words}; photos from such different distances differ in that, too"
+    words = f"{exposure.words}; very different distances make gains differ, too"
     return exposure._replace(called_for=None, words=words)
 
 
@@ -180,7 +180,7 @@ def camera_model_statistic(registration: dict[str, Any]) -> Statistic:
     if not chosen:
         given = registration.get("source") == "import"
         why = "no candidate makes a sound camera" if rows else "too few points to compare camera models"
-        return unknown("px", float("inf"), "the cameras were given" if given else why, False)
+        return unknown("px", float("inf"), "the cameras were imported" if given else why, False)
     # candidates come from the simplest on; a simple one that was not sound has no figure
     simplest = {row["group"]: row["held_out_px"] for row in reversed(rows) if row["held_out_px"] is not None}
     gained = sorted(((simplest[row["group"]] - row["held_out_px"], row) for row in chosen), key=lambda pair: -pair[0])

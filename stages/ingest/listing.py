@@ -43,7 +43,7 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     found = files_below(root, is_photo_folder)
     if not found:
         raise StageError("ingest.empty-folder", f"{root} is empty", "it holds no file", FOLDER_HINT)
-    photos, videos = [file for file in found if may_be_photo(file)], _videos(found)
+    photos, videos = [file for file in found if may_be_photo(file)], without_previews(found)
     unknown = not any(file.suffix.lower() in IMAGES + RAW_EXTENSIONS for file in photos)
     if len(videos) == 1 and unknown and len(photos) <= MAX_OTHER_FILES:
         photos = []  # a README, say; more of them may be photos of whatever ending
@@ -101,7 +101,7 @@ def is_video(file: Path) -> bool:
     return file.suffix.lower() in _VIDEOS
 
 
-def _videos(found: list[Path]) -> list[Path]:
+def without_previews(found: list[Path]) -> list[Path]:
     """The videos; previews of videos only where there is nothing else."""
     videos = [file for file in found if is_video(file)]
     return [file for file in videos if file.suffix.lower() not in _PREVIEWS] or videos

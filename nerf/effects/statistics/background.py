@@ -19,14 +19,14 @@ def background_statistic(
     The share of observations whose point does, and ``untracked``, are shown and decide nothing, so threshold and noise
     are infinite."""
     if has_alpha:
-        return Statistic(0.0, "share", NEVER, NEVER, False, "the photos' alpha says what is background")
+        return Statistic(0.0, "share", NEVER, NEVER, False, "the photos' alpha separates the background")
     seen = np.bincount(point, minlength=len(position)).astype(float)
     if not seen.any():
         return unknown("share", NEVER, "no tracks", True)
     beyond = np.abs(position).max(axis=1) > REGION_HALF_SIZE
     share = float(np.average(beyond, weights=seen))
     words = (
-        f"on unless alpha rules it out: {share:.1%} of the tracked points lie beyond the region of interest, and "
+        f"no alpha rules it out: {share:.1%} of the observations are of points beyond the region of interest, and "
         f"{untracked:.0%} of the photos' area has no point nearby"
     )
     return Statistic(share, "share", NEVER, NEVER, True, words)

@@ -167,7 +167,7 @@ def exposure_statistic(
     The noise, that of one usual gain, is beside it; what all gains have is taken off in quadrature, so that noise alone
     is no difference. Photos whose noise is an effect itself do not count, for a few would hide the others' gains, or
     pass for a difference; nor do ``odd`` ones, in which something stands before many of their points
-    (nerf/effects/statistics/transients.py) and draws their gains. ``told`` is what the camera wrote of each photo's
+    (nerf/effects/statistics/outlier_images.py) and draws their gains. ``told`` is what the camera wrote of each photo's
     exposure (EV up to a constant, NaN where nothing): a cross-check, which decides nothing because programs that
     develop photos change exposures and leave what was written.
     """
@@ -181,10 +181,10 @@ def exposure_statistic(
     span = float(np.ptp(gain.mean(axis=1)))
     ratio = f"{span / noise:.0f} × their noise" if noise > 0 else "without noise"
     alone = int(np.count_nonzero(~fit.known))
-    left_out = f"; {alone} photos share hardly any points with the others" if alone else ""
+    left_out = f"; {_photos(alone)} excluded: too few points shared with the others" if alone else ""
     strange, unsure = int(np.count_nonzero(fit.known & ~plain)), int(np.count_nonzero(plain & ~counted))
-    left_out += f"; without {strange} photo{'s' * (strange > 1)} with something in the way" if strange else ""
-    left_out += f"; {unsure} photos do not count, their gains are not known to {THRESHOLD_EV:.1g} EV" if unsure else ""
+    left_out += f"; {_photos(strange)} excluded as outliers" if strange else ""
+    left_out += f"; {_photos(unsure)} excluded: gain uncertain by over {THRESHOLD_EV:.1g} EV" if unsure else ""
     checked = "" if told is None else _beside_told(gain.mean(axis=1), told[counted])
     return classify(spread, noise, THRESHOLD_EV, "EV", f"gains span {span:.2g} EV, {ratio}{left_out}{checked}")
 
@@ -194,6 +194,11 @@ def or_all(some: Bool[np.ndarray, "views"], every: Bool[np.ndarray, "views"]) ->
     return some if np.count_nonzero(some) > 1 else every
 
 
+def _photos(count: int) -> str:
+    """3 photos, 1 photo."""
+    return f"{count} photo{'s' * (count != 1)}"
+
+
 def _beside_told(gain: Float[np.ndarray, "known"], told: Float[np.ndarray, "known"]) -> str:
     """How far the gains are from what the cameras wrote, in words; nothing where they wrote of less than two."""
     both = np.isfinite(told)
@@ -201,4 +206,4 @@ def _beside_told(gain: Float[np.ndarray, "known"], told: Float[np.ndarray, "know
         return ""
     apart = (gain - told)[both]
     apart = np.sqrt(np.mean((apart - apart.mean()) ** 2))
-    return f"; EXIF tells of {np.ptp(told[both]):.2g} EV, the gains deviate from it by {apart:.2g}"
+    return f"; EXIF exposures span {np.ptp(told[both]):.2g} EV, and the gains differ from them by {apart:.2g} EV (rms)"

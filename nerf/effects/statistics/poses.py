@@ -84,6 +84,6 @@ def pose_statistic(
     called_for = decide(common, noise, THRESHOLD_PX)
     if called_for is False and uncertain >= THRESHOLD_PX / GREY_ZONE:
         called_for = None
-    off = f"a quarter of the photos are off by {common:.2g} px or more as a whole, ± {noise:.1g}"
-    words = f"at 1000 pixels {off}; poses uncertain by {uncertain:.2g} px"
+    off = f"common reprojection error {common:.2g} ± {noise:.1g} px, pose uncertainty {uncertain:.2g} px"
+    words = f"upper quartile of the photos, at 1000 pixels: {off}"
     return Statistic(max(common, uncertain), PX, THRESHOLD_PX, noise, called_for, words)

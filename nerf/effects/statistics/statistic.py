@@ -46,4 +46,4 @@ def classify(statistic: float, noise: float, threshold: float, unit: str, words:
 
 def unknown(unit: str, threshold: float, why: str, called_for: bool | None) -> Statistic:
     """Nothing can be measured; ``called_for`` is what to do without knowing."""
-    return Statistic(0.0, unit, threshold, float("inf"), called_for, f"{why}: nothing known")
+    return Statistic(0.0, unit, threshold, float("inf"), called_for, f"not measured: {why}")

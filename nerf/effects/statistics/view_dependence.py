@@ -40,7 +40,7 @@ def view_dependence_statistic(tracks: TrackColours, fit: ExposureFit) -> Statist
     angle = np.degrees(np.arccos(cosine))
     low, high = np.quantile(angle, [1 / 3, 2 / 3]) if len(angle) else (0.0, 0.0)
     if len(angle) and high - low < MIN_SPREAD_DEG:
-        why = f"points are seen from directions {low:.1f}° to {high:.1f}° apart, too alike to compare"
+        why = f"the angles between viewing directions hardly vary: {low:.1f}° to {high:.1f}°"
         return unknown(unit, THRESHOLD, why, None)
     wide = angle >= high
     chosen = wide | (angle <= low)
@@ -61,7 +61,7 @@ def _classify(growth: float, noise: float, angle_deg: float) -> Statistic:
     """Variances as deviations; two noises more in the one are two more in the other."""
     deviation = float(np.sqrt(max(growth, 0.0)))
     uncertain = (float(np.sqrt(deviation**2 + 2 * noise)) - deviation) / 2
-    words = f"colours change by {deviation:.2g} of 1 over {angle_deg:.0f}°, ± {uncertain:.1g}"
+    words = f"colours change by {deviation:.2g} ± {uncertain:.1g} (sRGB from 0 to 1) over {angle_deg:.0f}°"
     return classify(deviation, uncertain, THRESHOLD, "sRGB", words)
 
 

@@ -32,7 +32,7 @@ def radial_slope(tracks: TrackColours, fit: ExposureFit) -> RadialSlope:
     y, square = log_light(tracks.colour[fit.used]), tracks.radius[fit.used] ** 2
     found = np.array([fit.layout.slope(y[:, channel], square, fit.weight[:, channel]) for channel in range(3)])
     slope, noise = float(found[:, 0].mean()), float(np.sqrt(np.mean(found[:, 1] ** 2)))
-    return RadialSlope(slope, noise, "" if np.isfinite(noise) else "every point lies at one radius in all photos")
+    return RadialSlope(slope, noise, "" if np.isfinite(noise) else "every point lies at the same radius in all photos")
 
 
 def vignetting_statistic(found: RadialSlope) -> Statistic:
@@ -40,7 +40,7 @@ def vignetting_statistic(found: RadialSlope) -> Statistic:
     if found.unknown_because:
         return unknown("EV", THRESHOLD_EV, found.unknown_because, False)
     slope, noise = found.slope / EV, found.noise / EV
-    words = f"corners are {abs(slope):.2g} EV {'darker' if slope < 0 else 'brighter'} than the middle, ± {noise:.1g}"
+    words = f"corners are {abs(slope):.2g} ± {noise:.1g} EV {'darker' if slope < 0 else 'brighter'} than the centre"
     return classify(-slope, noise, THRESHOLD_EV, "EV", words)
 
 

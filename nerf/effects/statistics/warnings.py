@@ -46,7 +46,7 @@ def tone_statistic(fit: ExposureFit) -> Statistic:
     contrast, error = fit.contrast[counted] * scale, fit.contrast_error[counted] * scale
     noise = float(np.median(error))
     spread = float(np.sqrt(max(np.mean(contrast**2) - np.mean(error**2), 0.0)))
-    words = f"gains differ by {spread:.2g} EV between bright and dark points, ± {noise:.1g}"
+    words = f"gains differ by {spread:.2g} ± {noise:.1g} EV between bright and dark points"
     return classify(spread, noise, THRESHOLD_EV, "EV", words)
 
 
@@ -64,7 +64,9 @@ def transients_statistic(outliers: OutlierImages, fit: ExposureFit) -> Statistic
         np.sum(outliers.variance[outliers.much]) if outliers.much.any() else np.mean(outliers.variance[outliers.seen])
     )
     noise = float(np.sqrt(variance)) / photos
-    words = f"{outliers.much.sum()} of {photos} photos show {found:.1%} of all points in another colour than the others"
+    words = (
+        f"{outliers.much.sum()} of {photos} photos are outliers: they show {found:.1%} of all points in another colour"
+    )
     return classify(found, noise, MIN_TRANSIENT_SHARE, "share", words)
 
 
@@ -87,7 +89,7 @@ def scale_variation_statistic(tracks: TrackColours) -> Statistic:
     off = np.sqrt(SIZE_QUANTILE * (1 - SIZE_QUANTILE) / len(ratio))
     below, above = np.quantile(ratio, [SIZE_QUANTILE - off, min(SIZE_QUANTILE + off, 1.0)])
     whole = _size_ratio_of_photos(tracks)
-    words = f"pixels at the same points differ {found:.2g}-fold in size, by way of other photos {whole:.2g}-fold"
+    words = f"pixel sizes differ {found:.2g}-fold at one point, and {whole:.2g}-fold between connected photos"
     return classify(max(found, whole), float(above - below) / 2, MIN_SIZE_RATIO, "×", words)
 
 
@@ -125,10 +127,10 @@ def participating_media_statistic(tracks: TrackColours, fit: ExposureFit) -> Sta
     )
     slope, error = layout.slope(np.log(np.ptp(light, axis=1) / light.mean(axis=1)), distance, weight)
     if not np.isfinite(error):
-        return unknown("", MIN_FADING, "every point is seen from one distance", False)
+        return unknown("", MIN_FADING, "every point is seen from the same distance", False)
     reach = float(np.ptp(np.quantile(layout.within_points(distance, weight), [0.05, 0.95])))
     fading = max(-slope * reach, 0.0)
-    words = f"colours fade by {1 - np.exp(-fading):.0%} from near to far photos, ± {error * reach:.0%}"
+    words = f"colours fade by {1 - np.exp(-fading):.0%} ± {error * reach:.0%} from near to far photos"
     found = classify(fading, error * reach, MIN_FADING, "", words)
     return found._replace(called_for=bool(found.called_for))
 
@@ -159,7 +161,7 @@ def rolling_shutter_statistic(
     moving = np.isfinite(speed) & (speed > MIN_MOTION_PX)
     kept = moving[view]
     if np.count_nonzero(kept) < 100 or np.count_nonzero(moving) < 3:
-        return unknown(PX, THRESHOLD_PX, "no video, or one that hardly moves", False)
+        return unknown(PX, THRESHOLD_PX, "no video, or hardly any motion", False)
     along = np.sum(residual[kept] * motion[view[kept]], axis=1) / speed[view[kept]]
     limit = 4 * OF_GAUSSIAN * float(np.median(np.abs(along)))
     along = np.clip(along, -limit, limit)  # false matches
@@ -170,8 +172,8 @@ def rolling_shutter_statistic(
     score = np.bincount(view[kept], expected * (along - readout * expected), len(speed))
     edge = float(np.median(speed[moving])) / 2
     noise = float(np.sqrt(np.sum(score**2))) / size * edge
-    off = f"at 1000 pixels {abs(readout) * edge:.2g} ± {noise:.1g} px at the edges"
-    words = f"rows take {abs(readout):.0%} of the time between frames, {off}"
+    off = f"{abs(readout) * edge:.2g} ± {noise:.1g} px at the upper and lower edges, at 1000 pixels"
+    words = f"readout takes {abs(readout):.0%} of the time between frames: {off}"
     found = classify(abs(readout) * edge, noise, THRESHOLD_PX, PX, words)
     return found._replace(called_for=bool(found.called_for))
 

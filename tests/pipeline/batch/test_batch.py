@@ -85,6 +85,9 @@ def test_a_page_shows_figures_links_and_a_picture(tmp_path: Path):
     renders = tmp_path / f"{HOSTILE}.nerf" / "output" / "renders"
     renders.mkdir(parents=True)
     Image.new("RGB", (800, 600), (255, 0, 0)).save(renders / "a.png")
+    broken = tmp_path / "low.nerf" / "output" / "renders" / "a.png"
+    broken.parent.mkdir(parents=True)
+    broken.write_bytes(b"no picture")
     (renders.parent / "report.html").touch()
     write_page(tmp_path, known)
     page = (tmp_path / PAGE).read_text("utf-8")
@@ -95,7 +98,7 @@ def test_a_page_shows_figures_links_and_a_picture(tmp_path: Path):
 
 
 def figures(psnr: float | None) -> dict[str, Any]:
-    return {"photos": 5, "registered": 5, "psnr": psnr, "ssim": 0.5, "cameras_doubtful": False, "verdict": ""}
+    return {"photos": 5, "registered": 5, "psnr": psnr, "ssim": 0.5, "cameras_doubtful": False}
 
 
 def test_words_of_the_batch_are_not_handed_on(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -106,16 +109,45 @@ def test_words_of_the_batch_are_not_handed_on(scenes: Path, tmp_path: Path, monk
     out = tmp_path / "out"
     words = [f"--output={out}", "--sfm.seed", "3", "--budget", "3m", "--json", "--effect", "exposure=on"]
     assert run_command(["batch", str(scenes), *words]) == 0
-    first = [str(scenes / HOSTILE), "-o", str(out / f"{HOSTILE}.nerf")]
-    assert said.read_text().splitlines()[0] == repr(
-        [*first, "--sfm.seed", "3", "--effect", "exposure=on", "--budget", "60s", "--json"]
-    )
+    given = ["--sfm.seed", "3", "--effect", "exposure=on", "--budget", "60s", "-o", str(out / f"{HOSTILE}.nerf")]
+    assert said.read_text().splitlines()[0] == repr([str(scenes / HOSTILE), *given, "--json"])
+
+
+@pytest.mark.parametrize("words", [["-o", "out"], ["-oout"], ["--output", "out"], ["--output=out"]])
+def test_the_folder_is_the_batchs_own(words: list[str], scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(scene_run, "COMMAND", ["-c", "import sys; assert sys.argv.count('-o') == 1"])
+    assert run_command(["batch", str(scenes), *words]) == 0
+    assert set(states(tmp_path / "out").values()) == {"done"}
+
+
+def test_other_scenes_do_not_take_over_a_batch(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """`batch mon/scenes`, then `batch tue/scenes`: both are called scenes.batch."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(scene_run, "COMMAND", ["-c", "pass"])
+    assert run_command(["batch", str(scenes)]) == run_command(["batch", "scenes"]) == 0
+    add_photos(tmp_path / "tue" / "scenes" / "a")
+    assert run_command(["batch", "tue/scenes"]) == exit_codes.USAGE
+    assert run_command(["batch", "tue/scenes", "-o", "scenes.batch"]) == 0
+
+
+def test_a_scene_for_which_no_time_is_left_says_so(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(scene_run, "COMMAND", ["-c", "import time; time.sleep(3.1)"])
+    out = tmp_path / "out"
+    assert run_command(["batch", str(scenes), "-o", str(out), "--budget", "4s"]) == exit_codes.BATCH
+    known = batch_file.read(out).scenes
+    assert [scene.state for scene in known.values()] == ["done", "failed", "failed"]
+    assert {one.failure.code for one in known.values() if one.failure} == {"pipeline.no-time-left"}
+    monkeypatch.setattr(scene_run, "COMMAND", ["-c", "pass"])
+    assert run_command(["batch", str(scenes), "-o", str(out), "--budget", "60s"]) == 0
+    assert batch_file.read(out).scenes[HOSTILE].allocated == known[HOSTILE].allocated, "done: it keeps its settings"
 
 
 @pytest.mark.parametrize(
     "words",
     [["--json", "scenes"], ["scenes", "--train.steps", "0"], ["scenes", "--budget", "2m", "--train.steps", "9"],
-     ["scenes", "--until", "lunch"], ["scenes", "--more", "2m"], ["scenes", "--budget", "soon"]],
+     ["scenes", "--until", "lunch"], ["scenes", "--more", "2m"], ["scenes", "--budget", "soon"],
+     ["scenes", "--budget", "3m", "--train.depth"], ["scenes", "--budget", "3m", "--until", "tradeoff"]],
 )  # fmt: skip
 def test_usage_errors_come_before_any_scene(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
@@ -135,6 +167,19 @@ def test_a_crash_is_told_by_its_signal_or_last_words(tmp_path: Path, monkeypatch
     spoke = ends_by("import sys; sys.exit('corrupt heap')", tmp_path, monkeypatch)
     assert spoke and spoke.code == "pipeline.scene-crashed" and "corrupt heap" in spoke.why
     assert ends_by("pass", tmp_path, monkeypatch) is None
+    printed = ends_by("print('a library speaks'); print('{event')", tmp_path, monkeypatch)
+    assert printed is None and "a library speaks" in (tmp_path / "log").read_text()
+    silent = ends_by("import sys; sys.exit(9)", tmp_path, monkeypatch)
+    assert silent and "library" not in silent.why, "the log of earlier attempts is none of it"
+
+
+def test_an_option_that_no_run_takes_has_a_reason(scenes: Path, tmp_path: Path):
+    options = ["--render.cameras", str(tmp_path / "gone.json"), "--render.frames", "5"]
+    code = run_command(["batch", str(scenes), "-o", str(tmp_path / "out"), *options])
+    assert code in (exit_codes.USAGE, exit_codes.BATCH)
+    if code == exit_codes.BATCH:
+        failures = [scene.failure for scene in batch_file.read(tmp_path / "out").scenes.values()]
+        assert all(failure and failure.why and failure.hint for failure in failures)
 
 
 def alive(pid: int) -> bool:
@@ -184,4 +229,4 @@ def test_two_batches_do_not_share_a_folder(scenes: Path, tmp_path: Path):
     out = tmp_path / "out"
     out.mkdir()
     with FileLock(out / ".lock"), refused("pipeline.batch-in-use", out):
-        run_batch(Batch(find_scenes(scenes), out, (), None), SilentDisplay())
+        run_batch(Batch(scenes, find_scenes(scenes), out, (), None), SilentDisplay())

@@ -18,31 +18,32 @@ def waiting(spent: float = 0) -> SceneState:
 
 
 def done(spent: float) -> SceneState:
-    return SceneState(photos="p", state="done", share=30, spent=spent)
+    return SceneState(photos="p", state="done", allocated=30, spent=spent)
 
 
 def test_scenes_that_wait_share_what_the_others_leave():
-    assert batch(a=waiting(), b=waiting(), c=waiting()).share("a") == pytest.approx(30)
-    assert batch(a=done(10), b=waiting(), c=waiting()).share("b") == pytest.approx(40)
-    assert batch(a=done(50), b=waiting(), c=waiting()).share("b") == pytest.approx(20)
+    assert batch(a=waiting(), b=waiting(), c=waiting()).allocated("a") == pytest.approx(30)
+    assert batch(a=done(10), b=waiting(), c=waiting()).allocated("b") == pytest.approx(40)
+    assert batch(a=done(50), b=waiting(), c=waiting()).allocated("b") == pytest.approx(20)
 
 
-def test_a_budget_that_is_spent_leaves_a_second():
-    assert batch(a=done(200), b=waiting()).share("b") == pytest.approx(1)
+def test_a_budget_that_is_spent_leaves_nothing():
+    left = batch(a=done(200), b=waiting()).allocated("b")
+    assert left is not None and left < 0
 
 
 def test_an_interrupted_scene_keeps_its_share():
-    stopped = SceneState(photos="p", state="running", share=30, spent=12)
-    assert batch(a=stopped, b=waiting(), c=waiting()).share("a") == pytest.approx(30)
-    assert batch(a=stopped, b=waiting(), c=waiting()).share("b") == pytest.approx(30)
+    stopped = SceneState(photos="p", state="running", allocated=30, spent=12)
+    assert batch(a=stopped, b=waiting(), c=waiting()).allocated("a") == pytest.approx(30)
+    assert batch(a=stopped, b=waiting(), c=waiting()).allocated("b") == pytest.approx(30)
 
 
-def test_a_scene_that_failed_before_gets_an_even_part():
-    assert batch(a=done(40), b=waiting(spent=5), c=done(45)).share("b") == pytest.approx(30)
+def test_what_a_failed_attempt_took_is_spent():
+    assert batch(a=done(40), b=waiting(spent=20), c=waiting()).allocated("b") == pytest.approx(15)
 
 
-def test_without_a_budget_there_is_no_share():
-    assert BatchFile(scenes={"a": waiting()}).share("a") is None
+def test_without_a_budget_nothing_is_allocated():
+    assert BatchFile(scenes={"a": done(5)}).allocated("a") is None
 
 
 def test_what_is_written_is_read(tmp_path: Path):

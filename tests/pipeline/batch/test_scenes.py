@@ -1,5 +1,7 @@
 """Which scenes a folder holds."""
 
+import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -22,6 +24,24 @@ def test_each_folder_and_each_video_is_a_scene(tmp_path: Path):
 def test_a_video_named_like_a_folder_keeps_its_ending(tmp_path: Path):
     touch(tmp_path / "c" / "x.jpg", tmp_path / "c.mp4", tmp_path / "c.mov")
     assert sorted(scene.name for scene in find_scenes(tmp_path)) == ["c", "c.mov", "c.mp4"]
+
+
+def test_previews_beside_videos_are_no_scenes(tmp_path: Path):
+    touch(*(tmp_path / name for name in ("GX01.MP4", "GX01.LRV", "DJI_1.MOV", "DJI_1.LRF")))
+    assert [scene.photos.name for scene in find_scenes(tmp_path)] == ["DJI_1.MOV", "GX01.MP4"]
+
+
+def test_no_two_scenes_share_a_name(tmp_path: Path):
+    touch(tmp_path / "a.mp4" / "x.jpg", tmp_path / "a" / "x.jpg", tmp_path / "a.mp4.mov", tmp_path / "b.mov")
+    names = [scene.name for scene in find_scenes(tmp_path)]
+    assert len(set(names)) == len(names) == 4
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have names of text alone")
+def test_a_name_that_is_no_text_is_written_as_one(tmp_path: Path):
+    os.mkdir(os.fsencode(tmp_path) + b"/caf\xe9")
+    (scene,) = find_scenes(tmp_path)
+    assert scene.name == "caf\\udce9" and scene.photos.is_dir()
 
 
 def test_workspaces_batches_and_hidden_folders_are_none(tmp_path: Path):

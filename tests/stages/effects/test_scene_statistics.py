@@ -84,15 +84,15 @@ def test_pose_errors_are_scaled_to_a_thousand_pixels(tmp_path: Path, shift: floa
     found = [geometric(tmp_path / str(width), width, shift)["pose_refinement"] for width in (800, 4000)]
     for one in found:
         assert one.value == pytest.approx(max(1000 * shift, 0.5), rel=0.05) and one.called_for is called_for
-        assert one.unit == "px at 1000" and one.words.startswith("at 1000 pixels a quarter of the photos are off by ")
-        assert one.words.endswith("; poses uncertain by 0.5 px")
+        assert one.unit == "px at 1000" and one.words.startswith("upper quartile of the photos, at 1000 pixels: ")
+        assert one.words.endswith(", pose uncertainty 0.5 px")
 
 
 def test_row_delays_are_scaled_to_a_thousand_pixels(tmp_path: Path) -> None:
     small, large = (geometric(tmp_path / str(width), width, 0.0, 0.5)["rolling_shutter"] for width in (800, 4000))
     assert small.called_for is large.called_for is True and small.unit == "px at 1000"
     assert large.value == pytest.approx(small.value, rel=0.05)
-    assert large.words.startswith("rows take ") and " between frames, at 1000 pixels " in large.words
+    assert large.words.startswith("readout takes ") and large.words.endswith(", at 1000 pixels")
     assert geometric(tmp_path / "upright", 800, 0.0, 0.5, turned=True)["rolling_shutter"].called_for is True
     # eleven thousandths of the width are motion enough, however small the photo is: here they are 1.8 of its pixels
     assert geometric(tmp_path / "icon", 160, 0.0, 0.5)["rolling_shutter"].called_for is True
@@ -105,7 +105,7 @@ def test_gains_across_distances_are_left_to_a_pilot(called_for: bool | None, see
     scale = Statistic(5.0 if seen else 2.0, "×", 4.0, 0.01, seen, "pixels differ")
     found = unless_pixels_differ(exposure, scale)
     if called_for and seen:
-        assert found.called_for is None and found.words.startswith("gains span 0.4 EV; photos from such different")
+        assert found.called_for is None and found.words.startswith("gains span 0.4 EV; very different distances")
     else:
         assert found == exposure
 
@@ -140,12 +140,12 @@ def test_a_pinhole_is_no_lens() -> None:
 @pytest.mark.parametrize(
     ("source", "rows", "why"),
     [
-        ("import", [], "the cameras were given"),
+        ("import", [], "the cameras were imported"),
         ("sfm", [], "too few points to compare camera models"),
         ("sfm", [candidate(0, "PINHOLE", None)], "no candidate makes a sound camera"),
     ],
 )
 def test_why_nothing_is_known_of_the_lens(source: str, rows: list[dict[str, Any]], why: str) -> None:
     found = camera_model_statistic({"source": source, "camera_models": rows})
-    assert found.words == f"{why}: nothing known" and found.called_for is False
+    assert found.words == f"not measured: {why}" and found.called_for is False
     assert np.isinf(found.noise) and np.isinf(found.threshold)

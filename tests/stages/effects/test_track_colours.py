@@ -274,7 +274,7 @@ def test_all_evidence_of_a_scene(tmp_path: Path, progress: SilentProgress) -> No
     # the last digits of a logarithm depend on the processor, and what is trained begins with these
     assert np.array_equal(found.measured["exposure"], np.round(found.measured["exposure"], 4))
     assert found.of["pose_refinement"].called_for is False
-    assert found.of["rolling_shutter"].words == "no video, or one that hardly moves: nothing known"
+    assert found.of["rolling_shutter"].words == "not measured: no video, or hardly any motion"
     for name, evidence in found.of.items():
         assert np.isfinite(evidence.value) and evidence.words, name
     assert set(found.seconds) == set(found.of) and min(found.seconds.values()) > 0

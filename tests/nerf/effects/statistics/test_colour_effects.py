@@ -53,7 +53,9 @@ def test_points_at_one_radius_say_nothing_of_vignetting() -> None:
     tracks = photographed_points(0)
     tracks = replace(tracks, radius=np.full(len(tracks), 0.5))
     found = vignetting.vignetting_statistic(vignetting.radial_slope(tracks, fit_exposure(tracks)))
-    assert found.called_for is False and found.words == "every point lies at one radius in all photos: nothing known"
+    assert (
+        found.called_for is False and found.words == "not measured: every point lies at the same radius in all photos"
+    )
 
 
 def test_diffuse_points_do_not_call_for_view_dependence() -> None:
@@ -93,7 +95,7 @@ def test_one_direction_says_nothing_of_view_dependence() -> None:
     tracks = replace(tracks, towards=np.tile([0.0, 0.0, 1.0], (len(tracks), 1)))
     found = view_dependence.view_dependence_statistic(tracks, fit_exposure(tracks))
     assert found.called_for is None and found.words == (
-        "points are seen from directions 0.0° to 0.0° apart, too alike to compare: nothing known"
+        "not measured: the angles between viewing directions hardly vary: 0.0° to 0.0°"
     )
 
 
@@ -123,7 +125,7 @@ def test_a_passer_by_in_few_photos_is_seen() -> None:
         tracks, expected = passed_by(seed, share=0.6)
         found = passers_by(tracks, expected)
         assert found.called_for is True, found
-        assert found.words.startswith("2 of 14 photos show ")
+        assert found.words.startswith("2 of 14 photos are outliers: ")
 
 
 def test_what_all_photos_have_is_no_passer_by() -> None:
@@ -190,5 +192,5 @@ def test_without_tracks_nothing_is_known() -> None:
         (passers_by(none, None), False),
         (warnings.participating_media_statistic(none, fit), False),
     ):
-        assert found.called_for is decided and found.words.endswith(": nothing known")
+        assert found.called_for is decided and found.words.startswith("not measured: ")
         assert found.value == 0 and np.isinf(found.noise)

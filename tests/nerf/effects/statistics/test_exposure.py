@@ -63,7 +63,7 @@ def test_occluded_photos_do_not_count() -> None:
     fit, odd = fit_exposure(photographed_points(5, log_gain=gain)), np.arange(12) < 3
     assert exposure_statistic(fit).called_for is True
     found = exposure_statistic(fit, None, odd)
-    assert found.called_for is False and "; without 3 photos with something in the way" in found.words
+    assert found.called_for is False and "; 3 photos excluded as outliers" in found.words
     assert exposure_statistic(fit, None, np.ones(12, bool)).value == exposure_statistic(fit).value
 
 
@@ -92,11 +92,11 @@ def test_a_photo_that_is_badly_measured_decides_nothing(deviation_ev: float, cal
         gain[4, 0], error[4, 0] = gain[4, 0] + 1.2 * EV, EV
         found = exposure_statistic(fit._replace(log_gain=gain, error=error), np.zeros(12))
         assert found.called_for is called_for, found
-        assert "; 1 photos do not count, their gains are not known to 0.1 EV; EXIF tells of 0 EV" in found.words
+        assert "; 1 photo excluded: gain uncertain by over 0.1 EV; EXIF exposures span 0 EV" in found.words
         bent = tone_statistic(fit._replace(contrast=np.eye(12)[4], contrast_error=fit.contrast_error + np.eye(12)[4]))
         assert bent.called_for is False
         unsure = exposure_statistic(fit._replace(error=fit.error + EV))
-        assert unsure.called_for is None and "do not count" not in unsure.words, "better than nothing"
+        assert unsure.called_for is None and "excluded" not in unsure.words, "better than nothing"
 
 
 def test_exif_exposures_decide_nothing() -> None:
@@ -105,8 +105,8 @@ def test_exif_exposures_decide_nothing() -> None:
     alone = exposure_statistic(fit)
     told = gain / EV + 7.0  # the constant is unknown
     agreeing, deviating = exposure_statistic(fit, told), exposure_statistic(fit, -told)
-    assert agreeing.words.startswith(f"{alone.words}; EXIF tells of 1 EV, the gains deviate from it by 0.0")
-    assert "deviate from it by 0.6" in deviating.words  # twice the gains' own deviation, 0.314
+    assert agreeing.words.startswith(f"{alone.words}; EXIF exposures span 1 EV, and the gains differ from them by 0.0")
+    assert "differ from them by 0.6" in deviating.words  # twice the gains' own deviation, 0.314
     assert agreeing[:5] == deviating[:5] == alone[:5]
     sparse = np.where(np.arange(12) < 1, told, np.nan)
     assert exposure_statistic(fit, sparse) == exposure_statistic(fit, np.full(12, np.nan)) == alone
@@ -149,14 +149,14 @@ def test_photos_without_common_points_have_infinite_error() -> None:
     np.testing.assert_array_equal(fit.known, [True] * 6 + [False] * 3)
     assert np.isinf(fit.error[6:]).all() and np.isfinite(fit.error[:6]).all()
     np.testing.assert_array_equal(fit.log_gain[6:], 0)
-    assert exposure_statistic(fit).words.endswith("; 3 photos share hardly any points with the others")
+    assert exposure_statistic(fit).words.endswith("; 3 photos excluded: too few points shared with the others")
 
 
 def test_without_tracks_nothing_is_known() -> None:
     fit = fit_exposure(TrackColours.empty(5))
     assert fit.log_gain.shape == (5, 3) and np.isinf(fit.error).all()
     assert exposure_statistic(fit).called_for is None and tone_statistic(fit).called_for is False
-    assert exposure_statistic(fit).words == tone_statistic(fit).words == "no tracks: nothing known"
+    assert exposure_statistic(fit).words == tone_statistic(fit).words == "not measured: no tracks"
 
 
 @pytest.mark.parametrize("points", [1, 3])

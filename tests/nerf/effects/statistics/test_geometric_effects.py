@@ -39,7 +39,7 @@ def test_far_and_near_photos_are_compared_through_others() -> None:
         point_size = np.random.default_rng(seed).uniform(0.5, 2, walk.point.max() + 1)[walk.point]
         found = scale_variation_statistic(replace(walk, footprint=point_size * 6.0 ** (walk.view / 29)))
         assert found.called_for is True and 4.5 < found.value < 6
-        assert found.words.startswith("pixels at the same points differ 1.2-fold in size, by way of other photos ")
+        assert found.words.startswith("pixel sizes differ 1.2-fold at one point, and ")
 
 
 def test_a_few_false_points_are_no_scale() -> None:
@@ -47,7 +47,7 @@ def test_a_few_false_points_are_no_scale() -> None:
     footprint = np.ones(len(tracks))
     footprint[:30:5] = 50
     assert 1 <= scale_variation_statistic(replace(tracks, footprint=footprint)).value < 1.2
-    assert scale_variation_statistic(TrackColours.empty(2)).words == "no tracks: nothing known"
+    assert scale_variation_statistic(TrackColours.empty(2)).words == "not measured: no tracks"
 
 
 @pytest.mark.parametrize("share", [0.0, 0.008, 0.05])
@@ -57,13 +57,13 @@ def test_background_is_modelled_unless_alpha_rules_it_out(share: float) -> None:
     found = background_statistic(position, np.repeat(np.arange(4000), 3), False, 0.1)
     assert found.called_for is True and abs(found.value - share) < 1e-9
     assert np.isinf([found.threshold, found.noise]).all()  # neither decides anything
-    assert f"{share:.1%} of the tracked points" in found.words and "10% of the photos' area" in found.words
+    assert f"{share:.1%} of the observations" in found.words and "10% of the photos' area" in found.words
 
 
 def test_alpha_says_what_is_background() -> None:
     assert background_statistic(np.full((9, 3), 5.0), np.arange(9), True, 0.5).called_for is False
     assert background_statistic(np.zeros((0, 3)), np.zeros(0, int), True, 1.0).called_for is False
-    assert background_statistic(np.zeros((0, 3)), np.zeros(0, int), False, 1.0).words == "no tracks: nothing known"
+    assert background_statistic(np.zeros((0, 3)), np.zeros(0, int), False, 1.0).words == "not measured: no tracks"
 
 
 def test_untracked_parts_of_photos() -> None:

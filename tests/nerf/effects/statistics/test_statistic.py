@@ -39,4 +39,4 @@ def test_more_noise_never_decides_more(statistic: float, noise: float, threshold
 
 
 def test_unknown_says_so() -> None:
-    assert unknown("EV", 0.1, "no tracks", None) == (0.0, "EV", 0.1, INFINITE, None, "no tracks: nothing known")
+    assert unknown("EV", 0.1, "no tracks", None) == (0.0, "EV", 0.1, INFINITE, None, "not measured: no tracks")
