@@ -39,7 +39,8 @@ def test_it_follows_a_training_to_the_end_it_asks_for(browser: Any, tmp_path: Pa
         assert page.faults == []
         page.run("window.before = true")
         write(training.root, RunFile(keys=KEYS | {"train": "e" * 64}))
-        page.until("!window.before && window.follower?.state?.phase === 'waiting'")  # another training was begun
+        # Another training was begun. The page loads anew meanwhile, which Viewer.until would not outlive.
+        page.page.wait_for_function("!window.before && window.follower?.state?.phase === 'waiting'")
         server.close()
         page.close()
 
