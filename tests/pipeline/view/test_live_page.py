@@ -11,7 +11,7 @@ from pipeline.engine.run_file import RunFile, write
 from pipeline.view import redirect_file
 from tests.pipeline.view.running_training import KEYS, RunningTraining
 from tests.pipeline.view.test_server import Served
-from tests.stages.viewer.browser import Viewer, chromium
+from tests.stages.viewer.browser import WAIT_SECONDS, Viewer, chromium
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,8 @@ def test_it_follows_a_training_to_the_end_it_asks_for(browser: Any, tmp_path: Pa
         page.run("window.before = true")
         write(training.root, RunFile(keys=KEYS | {"train": "e" * 64}))
         # Another training was begun. The page loads anew meanwhile, which Viewer.until would not outlive.
-        page.page.wait_for_function("!window.before && window.follower?.state?.phase === 'waiting'")
+        page.page.get_by_text("The training has not begun.").wait_for(state="attached")
+        assert page.run("!window.before")
         server.close()
         page.close()
 
@@ -62,9 +63,10 @@ def test_what_cannot_be_drawn_is_no_end_of_the_server(browser: Any, tmp_path: Pa
 def test_a_file_opens_the_page(browser: Any, tmp_path: Path) -> None:
     server = Served(RunningTraining(tmp_path).root)
     page = browser.new_page()
+    page.set_default_timeout(1000 * WAIT_SECONDS)
     page.goto(redirect_file(server.server.url, tmp_path).as_uri())
     page.wait_for_url(server.server.url)
-    page.wait_for_function("document.getElementById('live-phase').textContent.includes('No training')")
+    page.get_by_text("No training is running").wait_for(state="attached")
     page.close()
     server.close()
 
