@@ -1,7 +1,6 @@
 """One scene: `pipeline run` in a process of its own, so that whatever happens there ends that scene alone."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from pipeline.batch.batch_file import SceneFailure
+from stages.hardware.child_process import child_environment
 
 COMMAND = ["-P", "-m", "pipeline.cli.attended", "run"]  # -P: nothing in the current folder is taken for a module
 NO_REASON = {"why": "an option is wrong", "hint": "Correct it, and give the command again."}  # of a usage error
@@ -52,13 +52,12 @@ def run_scene(
 
 @contextmanager
 def _started(arguments: Sequence[str], log: IO[str]) -> Iterator["subprocess.Popen[str]"]:
-    path = os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))))
     child = subprocess.Popen(
         [sys.executable, *COMMAND, *arguments, "--json"],
         stdin=subprocess.PIPE,  # open as long as this process lives
         stdout=subprocess.PIPE,
         stderr=log,
-        env={**os.environ, "PYTHONPATH": path},
+        env=child_environment(),
         encoding="utf-8",
         errors="replace",
         start_new_session=True,  # Ctrl-C reaches this process alone, which hands it on

@@ -35,7 +35,7 @@ from pipeline.engine.failures import StageFailed
 from pipeline.engine.runner import Runner
 from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace
-from pipeline.view import beside, check_installed, open_browser
+from pipeline.view import check_installed, open_browser, serve_during
 from stages.contract import StageError
 from stages.io.amounts import duration
 
@@ -365,13 +365,13 @@ def command_resume(words: Sequence[str]) -> int:
 
 @contextmanager
 def _watched(root: Path, wanted: bool, display: Display) -> Iterator[None]:
-    """The block, with a server for browsers beside it where that is ``wanted``."""
+    """The block, with a server for browsers meanwhile where that is ``wanted``."""
     if not wanted:
         yield
         return
-    with beside(root) as url:
+    with serve_during(root) as url:
         display.headline(f"view it: {url}")
-        open_browser(url)
+        open_browser(url, root)
         yield
 
 
@@ -384,7 +384,7 @@ def command_view(words: Sequence[str]) -> int:
 
     server = ViewServer(workspace.root, given.port)
     print(json.dumps({"event": "view", "url": server.url}) if given.json else f"view it: {server.url}", flush=True)
-    open_browser(server.url)
+    open_browser(server.url, workspace.root)
     server.run()
     return 0
 

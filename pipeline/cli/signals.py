@@ -29,7 +29,7 @@ def go_on(words: Sequence[str]) -> str:
     """What takes up again the work of a command line that was stopped."""
     way = "the same command continues"
     if words[0] == "view":
-        return "A training at work goes on without it; the same command shows it again."
+        return "A running training goes on without it; the same command shows it again."
     if words[0] in ("run", "resume"):  # what was asked for is recorded before any stage begins
         way = "`pipeline resume WORKSPACE` continues"
     elif words[0] == "batch":

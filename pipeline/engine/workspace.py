@@ -10,6 +10,7 @@ import re
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from threading import Lock
 
 from filelock import FileLock, Timeout
 
@@ -53,6 +54,7 @@ class Workspace:
     def __init__(self, root: Path) -> None:
         self.root = root
         self._lock = FileLock(root / ".lock")
+        self._asking = Lock()  # threads that ask at once would take each other for a run
 
     @classmethod
     def existing(cls, root: Path) -> "Workspace":
@@ -103,7 +105,7 @@ class Workspace:
         if not (self.root / ".lock.pid").exists():  # a killed process leaves it, so the lock decides
             return None
         try:
-            with self._lock.acquire(timeout=0):
+            with self._asking, self._lock.acquire(timeout=0):
                 return None
         except Timeout:
             return self._holder()

@@ -1,4 +1,4 @@
-"""The server beside `pipeline run --view`: says its address in a line of JSON and ends after its standard input."""
+"""The server of `pipeline run --view`: says its address in a line of JSON and ends after its standard input."""
 
 import json
 import sys

@@ -40,14 +40,16 @@ HEADERS = {
     "X-Frame-Options": "DENY",
 }
 NICENESS = 10  # the training goes first
-LINGER_SECONDS = 10.0  # at most, after the run beside which it serves, for pages to get the last field
-OPEN_SECONDS = 4.0  # a page that has not asked for so long is closed
+LINGER_SECONDS = 10.0  # at most, after the run during which it serves, for pages to get the last field
+OPEN_SECONDS = 4.0  # a page that has not asked for so long is closed: longer than SLOW_POLL_MS in live.js
 
 
 def listening(port: int | None) -> socket.socket:
     """A socket at this port of this machine alone; None: a free one. Raises StageError where it is taken."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
+        if os.name == "posix":  # what is left of connections of an earlier server does not keep the port
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((ADDRESS, port or 0))
         listener.listen()  # so that whoever is told the address may ask at once
     except OSError as error:
@@ -119,7 +121,9 @@ class ViewServer:
         headers = request.headers
         host, origin = headers.get("host", ""), headers.get("origin")
         foreign = origin is not None and origin != f"http://{host}"
-        foreign |= headers.get("sec-fetch-site", "none") not in ("none", "same-origin")
+        # Whoever has the page's address may go there: so does the file that opens the browser.
+        opens = request.url.path == f"/{self.token}/" and headers.get("sec-fetch-dest") == "document"
+        foreign |= headers.get("sec-fetch-site", "none") not in ("none", "same-origin") and not opens
         foreign |= request.method == "POST" and origin is None
         if len(headers.getlist("host")) != 1 or host not in hosts or foreign:
             response = Response("refused", 403)
@@ -134,8 +138,10 @@ class ViewServer:
         return Response(page("live") if file is None else file.read_bytes(), media_type="text/html")
 
     def _state(self, request: Request) -> Response:
-        self.asked = time.monotonic()
-        return JSONResponse(self.state.watched())
+        self.asked, told = time.monotonic(), self.state.watched()
+        if told["field"] != FINISHED:  # the last field is one to come
+            self.served_last = math.inf
+        return JSONResponse(told)
 
     def _scene(self, request: Request) -> Response:
         return _packed(self.state.scene())

@@ -1,4 +1,4 @@
-"""What a workspace has to show: nothing yet, a training at work, one that was stopped, one that is finished.
+"""What a workspace has to show: nothing yet, a running training, one that was stopped, one that is finished.
 
 All of it comes from files, read anew each time, so it does not matter which side is started, ended or killed first.
 """
@@ -11,7 +11,7 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any, Literal
 
 from pipeline.engine import manifests
-from pipeline.engine.manifests import BadManifest
+from pipeline.engine.manifests import BadManifest, Manifest
 from pipeline.engine.workspace import Workspace
 from stages.contract import StageError
 from stages.train.live import LIVE, STATE, ask_to_finish, touch
@@ -27,9 +27,10 @@ FINISHED = "finished"  # the name of a finished training's field; others are tho
 
 @dataclass(frozen=True)
 class Training:
-    """Where a training stands: its folder, and what it last said of itself."""
+    """Where a training stands: its key, its folder, and what it last said of itself."""
 
     phase: Phase
+    key: str | None
     folder: Path | None
     told: dict[str, Any]
 
@@ -62,18 +63,19 @@ class WorkspaceState:
     def training(self) -> Training:
         """The training that the workspace's recorded run has, or is to have."""
         running = self.workspace.running() is not None
-        key = self._keys().get("train")
+        keys = self._keys()
+        key = keys.get("train")
         if key is None:
-            return Training("waiting" if running else "stopped", None, {})
+            return Training("waiting" if running else "stopped", None, None, {})
         partial, finished = self.workspace.partial("train", key), self.workspace.folder("train", key)
         told = _told(partial)
         if partial.is_dir() and (running or told):
-            return Training("training" if running else "stopped", partial, told)
-        try:
-            manifest = manifests.read(finished)
-        except (FileNotFoundError, BadManifest):
-            return Training("waiting" if running else "stopped", None, {})
-        return Training("finished", finished, _told_by(manifest.facts, finished))
+            return Training("training" if running else "stopped", key, partial, told)
+        manifest, scene = self._finished("train", keys), self._finished("normalise", keys)
+        # A run that has not come to stage train yet may have another scene already.
+        if manifest is None or scene is None or manifest.inputs.get("normalise") != scene.outputs_digest:
+            return Training("waiting" if running else "stopped", key, None, {})
+        return Training("finished", key, finished, _told_by(manifest.facts, finished))
 
     def watched(self) -> dict[str, Any]:
         """What a page is told, which from now on counts as one that watches."""
@@ -81,17 +83,23 @@ class WorkspaceState:
         if training.phase == "training" and training.folder is not None:
             touch(training.folder)
         told = {name: value for name, value in training.told.items() if name != "field"}
-        return told | {"phase": training.phase, "field": training.field}
+        return told | {"phase": training.phase, "key": training.key, "field": training.field}
 
     def finish(self) -> bool:
-        """Ask the training to end early; False where none is at work."""
+        """Ask the training to end early; False where none runs."""
         training = self.training()
         return training.phase == "training" and training.folder is not None and ask_to_finish(training.folder)
 
     def finished_page(self) -> Path | None:
-        """viewer.html, where nothing newer is on its way."""
-        page = self.workspace.root / "output" / "viewer.html"
-        return page if self.training().phase == "finished" and page.is_file() else None
+        """viewer.html of the finished training; None while a run may make another, which a page is to follow."""
+        if self.workspace.running() is not None or self.training().phase != "finished":
+            return None
+        keys = self._keys()
+        train, viewer = self._finished("train", keys), self._finished("viewer", keys)
+        if train is None or viewer is None or viewer.inputs.get("train") != train.outputs_digest:
+            return None
+        page = self.workspace.folder("viewer", viewer.key) / "viewer.html"
+        return page if page.is_file() else None
 
     def scene(self) -> bytes | None:
         """Cameras, points and what else does not change; None before there is a field."""
@@ -106,7 +114,7 @@ class WorkspaceState:
                 return None
 
     def field(self, name: str) -> bytes | None:
-        """The field of that name, packed once for all pages; None where it is not the latest any more."""
+        """The field of that name, that of a snapshot packed once for all pages; None where it is not the latest."""
         with self.lock:
             if self.packed[0] == name and name != FINISHED:
                 return self.packed[1]
@@ -132,6 +140,13 @@ class WorkspaceState:
             self.contents, self.of_scene = LiveContents(there), tuple(there.values())
         return self.contents
 
+    def _finished(self, stage: str, keys: dict[str, str]) -> Manifest | None:
+        """What the finished ``stage`` of these keys says of itself; None where there is none."""
+        try:
+            return manifests.read(self.workspace.folder(stage, keys[stage]))
+        except (KeyError, FileNotFoundError, BadManifest):
+            return None
+
     def _keys(self) -> dict[str, str]:
         try:
             return self.workspace.read_run().keys
@@ -147,7 +162,7 @@ def _told(partial: Path) -> dict[str, Any]:
 
 
 def _told_by(facts: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """What a finished training says of itself, as one at work does."""
+    """What a finished training says of itself, as a running one does."""
     curve: list[dict[str, Any]] = []
     with suppress(OSError, ValueError, KeyError):  # a record, which nothing needs
         curve = json.loads((folder / "curve.json").read_text("utf-8"))["points"]

@@ -4,7 +4,6 @@ What it does is in stages/sfm/worker.py.
 """
 
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from stages.contract import Progress, StageError
+from stages.hardware.child_process import child_environment
 from stages.io.photos import Photo
 from stages.io.stopwatch import live_line
 from stages.sfm.registration import count_done
@@ -98,10 +98,9 @@ def _start(stderr: IO[bytes]) -> subprocess.Popen[bytes]:
 
 def environment() -> dict[str, str]:
     """Of a child process in which COLMAP runs."""
-    path = os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))))
     # Work is divided by photos and pairs; threads inside linear algebra would let roundings depend on the number of
     # cores and on what else the machine does.
-    return {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    return child_environment() | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 def _hand_over(stdin: IO[bytes], job: dict[str, Any]) -> None:

@@ -1,7 +1,7 @@
-"""What a training at work shows to whoever watches, and what they may ask of it: the files in ``live/`` of its folder.
+"""What a running training shows to whoever watches, and what they may ask of it: the files in ``live/`` of its folder.
 
 A watcher (pipeline/view) touches WATCHED while a page is open. Only then does the training write: STATE every
-LOOK_SECONDS, and the field, as a finished training has it, every SNAPSHOT_SECONDS or as rarely as MAX_FRACTION of the
+POLL_SECONDS, and the field, as a finished training has it, every SNAPSHOT_SECONDS or as rarely as MAX_FRACTION of the
 time demands. Where FINISH lies the training is to end early. Neither side waits for the other, and either may die at
 any time: files appear whole, and of all that lies here training reads nothing but that FINISH is there.
 """
@@ -19,7 +19,7 @@ from typing import Any
 from stages.io.files import write_json
 
 LIVE, WATCHED, FINISH, STATE = "live", "watched", "finish", "state.json"
-LOOK_SECONDS = 1.0  # between two looks at WATCHED: two system calls, all that a training nobody watches pays
+POLL_SECONDS = 1.0  # between two looks at WATCHED: two system calls, all that a training nobody watches pays
 FORGET_SECONDS = 5.0  # after the last touch nobody is there any more
 SNAPSHOT_SECONDS = 4.0  # between two fields that are written, at least
 MAX_FRACTION = 0.01  # of a watched training's time that goes into them; a page's server takes about as much beside it
@@ -31,7 +31,7 @@ class LiveFolder:
 
     def __init__(self, folder: Path, save: Callable[[Path], None]) -> None:
         self.root, self.save = folder / LIVE, save
-        self.next_look = self.next_snapshot = 0.0  # by time.monotonic
+        self.next_poll = self.next_snapshot = 0.0  # by time.monotonic
         self.touched, self.watched_until = 0.0, -math.inf
         self.snapshots: list[Path] = []
         self.root.mkdir(exist_ok=True)
@@ -49,10 +49,10 @@ class LiveFolder:
         """Whether a watcher wants the training to end."""
         return (self.root / FINISH).exists()
 
-    def look(self) -> bool:
+    def is_watched(self) -> bool:
         """Whether anybody watches. By how WATCHED changes, not by what its time is: clocks may differ."""
         now = time.monotonic()
-        self.next_look = now + LOOK_SECONDS
+        self.next_poll = now + POLL_SECONDS
         with suppress(OSError):  # a user may have deleted it
             if (touched := (self.root / WATCHED).stat().st_mtime) != self.touched:
                 self.touched, self.watched_until = touched, now + FORGET_SECONDS
@@ -61,23 +61,29 @@ class LiveFolder:
     def show(self, state: dict[str, Any]) -> None:
         """Write ``state`` with the name of the latest field, and that field if it is due. Nothing here ends a training:
         a full disk is said by those whose files matter, a figure that is not finite by the loop."""
-        with suppress(OSError, ValueError):
-            if time.monotonic() >= self.next_snapshot:
+        if time.monotonic() >= self.next_snapshot:
+            with suppress(OSError, ValueError):
                 self._save_field()
+        with suppress(OSError, ValueError):
             temporary = self.root / f"{STATE}.tmp"
             write_json(temporary, state | {"field": self.snapshots[-1].name if self.snapshots else None})
             temporary.replace(self.root / STATE)
 
     def _save_field(self) -> None:
-        started = time.monotonic()
-        folder = self.root / secrets.token_hex(8)
-        folder.mkdir()
-        self.save(folder)
+        """A field that cannot be written whole leaves nothing behind, and is no reason to try again sooner."""
+        started, folder = time.monotonic(), self.root / secrets.token_hex(8)
+        try:
+            folder.mkdir()
+            self.save(folder)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        finally:
+            now = time.monotonic()
+            self.next_snapshot = now + max(SNAPSHOT_SECONDS, (now - started) / MAX_FRACTION)
         self.snapshots.append(folder)
         while len(self.snapshots) > KEPT:
-            shutil.rmtree(self.snapshots.pop(0))
-        now = time.monotonic()
-        self.next_snapshot = now + max(SNAPSHOT_SECONDS, (now - started) / MAX_FRACTION)
+            shutil.rmtree(self.snapshots.pop(0), ignore_errors=True)
 
     def close(self) -> None:
         """The training has ended. Under another name first: then no watcher can add to it while it is removed."""
@@ -89,18 +95,18 @@ class LiveFolder:
 
 
 def touch(folder: Path) -> bool:
-    """Say to the training in ``folder`` that somebody watches; False where none is at work there."""
+    """Say to the training in ``folder`` that somebody watches; False where none runs there."""
     try:
         os.utime(folder / LIVE / WATCHED)
-    except FileNotFoundError:
+    except OSError:  # also one of another user
         return False
     return True
 
 
 def ask_to_finish(folder: Path) -> bool:
-    """Ask the training in ``folder`` to end early; False where none is at work there."""
+    """Ask the training in ``folder`` to end early; False where none runs there."""
     try:
         (folder / LIVE / FINISH).touch()
-    except (FileNotFoundError, NotADirectoryError):
+    except OSError:
         return False
     return True

@@ -221,7 +221,7 @@ class TrainingRun:
             if time.monotonic() >= self.next_checkpoint:
                 self._check_health()
                 self._save()
-            if self.live is not None and time.monotonic() >= self.live.next_look:
+            if self.live is not None and time.monotonic() >= self.live.next_poll:
                 self._heed_watchers(self.live)
         self._check_final_health()
         if not self._is_finished:
@@ -317,11 +317,13 @@ class TrainingRun:
 
     def _heed_watchers(self, live: LiveFolder) -> None:
         """Show those who watch how it stands, and finish early where they ask for it. Before MIN_HEALTHY_STEPS nobody
-        could tell whether the field is sound: a request waits until then."""
-        wanted = live.is_asked_to_finish and self.schedule.revisions[-1].reason != "finish"
-        if wanted and MIN_HEALTHY_STEPS <= self.state.step < self.schedule.total_steps:
+        could tell whether the field is sound, and after a roll-back the schedule has no revision until its latest: a
+        request waits until then."""
+        last = self.schedule.revisions[-1]
+        wanted = live.is_asked_to_finish and last.reason != "finish"
+        if wanted and max(MIN_HEALTHY_STEPS, last.from_step) <= self.state.step < last.total_steps:
             self._finish_early()
-        if live.look() and self.speed.count:
+        if live.is_watched() and self.speed.count:
             live.show(self._live_state())
 
     def _finish_early(self) -> None:

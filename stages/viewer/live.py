@@ -1,4 +1,4 @@
-"""What the page shows of a training at work: its scene once, then field after field, packed for speed and not for size.
+"""What the page shows of a running training: its scene once, then field after field, packed for speed and not for size.
 
 A field as :func:`stages.io.field_files.save_field` wrote it becomes 16 bits a number, row by row: about as much work as
 reading it, and lossless to the eye. The file that stage viewer writes in the end is smaller.

@@ -54,7 +54,7 @@ def binary(contents: "Contents") -> bytes:
 
 
 def page(kind: Literal["still", "not drawn", "live"], payload: str = "") -> str:
-    """The HTML around the contents; of a training at work, ``live``, these come from a server."""
+    """The HTML around the contents; of a running training, ``live``, these come from a server."""
     environment = Environment(
         loader=FileSystemLoader(FILES), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )

@@ -1,69 +1,86 @@
-// A training at work: what its server (pipeline/view) tells, and field after field as it comes.
+// A running training: what its server (pipeline/view) tells, and field after field as it comes.
 
-const ASK_MS = 1000;
-const SHARE = 0.1; // of the time in which pixels fill in: without a graphics chip the training and the page share the cores
+const POLL_MS = 1000;
+const SLOW_POLL_MS = 3000; // where nothing changes: less than OPEN_SECONDS of the server
+const STRIP_FRACTION = 0.1; // of the time in which pixels fill in: without a graphics chip the training and the page share the cores
 const SVG = "http://www.w3.org/2000/svg";
 
 class Follower {
   constructor() {
     this.shown = null; // the name of the field that is drawn
+    this.key = null; // of the training that is followed
     byId("finish").addEventListener("click", () => this.finish());
-    this.ask();
+    this.poll();
   }
 
-  /** Asks how the training stands, and once more a second later. */
-  async ask() {
+  /** Asks how the training stands, and again later: after the end, too, for another may follow. */
+  async poll() {
+    let state = null;
     try {
-      const response = await fetch("state");
-      if (!response.ok) throw new Error(`the server answers ${response.status}`);
-      this.state = await response.json();
-      this.tell(this.state);
-      await this.follow(this.state.field);
-    } catch (error) {
-      byId("live-phase").textContent = this.shown ? "The server has ended; what it showed last stays." : "The server has ended.";
-      byId("finish").disabled = true;
-      if (!(error instanceof TypeError)) console.error(error); // fetch throws that one where nobody answers
+      state = await this.answer("state", "json");
+      if (!state) return;
+      if (this.key && state.key && state.key !== this.key) return location.reload(); // its scene may be another
+      this.key = state.key ?? this.key;
+      this.state = state;
+      this.tell(state);
+      await this.follow(state.field);
+    } finally {
+      const isDone = state?.phase === "finished" && (this.cannot || this.shown === state.field);
+      setTimeout(() => this.poll(), isDone || !state ? SLOW_POLL_MS : POLL_MS);
     }
-    if (this.state?.phase !== "finished" || this.shown !== this.state.field) setTimeout(() => this.ask(), ASK_MS);
+  }
+
+  /** What the server answers, as "json" or "arrayBuffer"; null where that is nothing, which is then said. */
+  async answer(address, kind, options) {
+    try {
+      const response = await fetch(address, options);
+      if (response.status === 200) return await response[kind]();
+      if (!response.ok) this.fault(`The server answers ${response.status}; its terminal says why.`);
+    } catch (error) {
+      const ended = this.shown ? "The server has ended; what it showed last stays." : "The server has ended.";
+      this.fault(error instanceof TypeError ? ended : `The server's answer cannot be read: ${error.message}`);
+    }
+    return null;
+  }
+
+  fault(text) {
+    byId("live-phase").textContent = text;
+    byId("finish").disabled = true;
   }
 
   /** Draws the field of that name, if it is another than the one that is drawn. */
   async follow(name) {
     if (!name || name === this.shown || this.cannot) return;
-    const field = await this.fetched(`field/${name}`);
+    const field = await this.answer(`field/${name}`, "arrayBuffer");
     if (!field) return; // the training has gone on: the next answer names a newer one
-    if (!field.field) return this.fail("This field cannot be drawn while it trains: the page draws hash-grid fields. Its figures are in the menu.");
-    if (!window.viewer) {
-      const scene = await this.fetched("scene");
-      if (!scene) return;
-      const { field: settings, section } = field;
-      const contents = { ...scene, field: settings, section: (part) => section(part) ?? scene.section(part) };
-      try {
-        await open(contents);
-      } catch (error) {
-        this.cannot = true;
-        sayWhyNot(error);
-      }
+    const scene = window.viewer ? null : await this.answer("scene", "arrayBuffer");
+    if (!scene && !window.viewer) return;
+    try {
+      if (await this.draw(contentsOf(field), scene && contentsOf(scene))) this.shown = name;
+    } catch (error) {
+      this.cannot = true;
+      sayWhyNot(error);
+      console.error(error);
     }
-    window.viewer.renderer.share = this.state.phase === "training" ? SHARE : 1;
+  }
+
+  /** Whether the page can draw such a field. */
+  async draw(field, scene) {
+    if (!field.field) {
+      this.cannot = true;
+      say("This field cannot be drawn while it trains: the page draws hash-grid fields. Its figures are in the menu.");
+      return false;
+    }
+    const section = (part) => field.section(part) ?? scene.section(part);
+    if (!window.viewer) await open({ ...scene, field: field.field, section });
+    window.viewer.renderer.stripFraction = this.state.phase === "training" ? STRIP_FRACTION : 1;
     window.viewer.replace(field);
-    this.shown = name;
-  }
-
-  fail(text) {
-    this.cannot = true;
-    say(text);
-  }
-
-  async fetched(what) {
-    const response = await fetch(what);
-    return response.status === 200 ? contentsOf(await response.arrayBuffer()) : null;
+    return true;
   }
 
   async finish() {
     byId("finish").disabled = true;
-    await fetch("finish", { method: "POST" });
-    this.asked = true;
+    this.asked = Boolean((await this.answer("finish", "json", { method: "POST" }))?.asked);
   }
 
   /** Brings the figures in line with what the server told. */
@@ -72,7 +89,7 @@ class Follower {
     byId("live-phase").textContent = {
       waiting: "The training has not begun.",
       training: finishing ? `Finishing${at}` : `Training${at}`,
-      stopped: `No training is at work${at}. pipeline resume continues it.`,
+      stopped: `No training is running${at}. pipeline resume continues it.`,
       finished: `Finished${at}`,
     }[phase];
     const figures = [
@@ -83,6 +100,7 @@ class Follower {
     byId("live-figures").textContent = figures.filter(Boolean).join(" · ");
     byId("live-progress").value = progress ?? (this.shown ? 1 : 0); // between the last step and the finished folder: 1
     byId("finish").hidden = phase !== "training" || step === undefined;
+    if (phase !== "training") this.asked = false;
     byId("finish").disabled = Boolean(finishing || this.asked);
     byId("finish").textContent = finishing ? "Finishing …" : this.asked ? "Asked to finish …" : "Finish now";
     drawCurve(byId("live-curve"), curve ?? []);

@@ -70,9 +70,9 @@ class Viewer {
 
   /** Another field of the same scene, and the exposures that go with it. */
   replace({ field, gains, section }) {
-    const { contents } = this, before = contents.section;
+    const { contents } = this, first = (this.firstSection ??= contents.section); // of its parts, not of the last field's
     contents.views.forEach((view, index) => Object.assign(view, gains[index]));
-    Object.assign(contents, { field, section: (name) => section(name) ?? before(name) });
+    Object.assign(contents, { field, section: (name) => section(name) ?? first(name) });
     this.renderer.load(contents);
   }
 
@@ -235,7 +235,6 @@ function sayWhyNot(error) {
   say(error.message === "no WebGL2"
     ? "WebGL 2 is turned off in this browser or not supported by its graphics driver; the scene is drawn with it."
     : `The scene cannot be drawn here: ${error.message}`);
-  throw error;
 }
 
 async function start() {
@@ -245,5 +244,6 @@ async function start() {
     await open(await unpacked(byId("payload").textContent));
   } catch (error) {
     sayWhyNot(error);
+    throw error;
   }
 }

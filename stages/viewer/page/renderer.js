@@ -15,7 +15,7 @@ class Renderer {
   constructor(canvas, contents, request, over) {
     Object.assign(this, { canvas, contents, request, over });
     this.movingPixels = this.stripPixels = MIN_PIXELS;
-    this.share = 1; // of the time that strips may take: less where a training needs the machine
+    this.stripFraction = 1; // of the time that strips may take: less where a training needs the machine
     this.restore();
   }
 
@@ -108,7 +108,7 @@ class Renderer {
     this.start(() => this.graphics.draw(this.fine, request, height - to, height - from), (ms) => {
       this.stripPixels = Math.max(width, width * (to - from) * clamp(STRIP_MS / ms, 1 / MAX_GROWTH, MAX_GROWTH));
       if (this.stale) return;
-      this.restsUntil = now() + ms * (1 / this.share - 1);
+      this.restsUntil = now() + ms * (1 / this.stripFraction - 1);
       this.filled = to;
       this.show(this.fine);
     });

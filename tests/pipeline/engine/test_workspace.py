@@ -7,6 +7,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from threading import Thread
 from types import SimpleNamespace
 from typing import Any
 
@@ -194,6 +195,17 @@ def test_a_killed_process_is_not_running(tmp_path: Path):
     assert asked.running() is None
     with Workspace(tmp_path):  # the question did not take the lock
         pass
+
+
+def test_threads_that_ask_at_once_see_no_run(tmp_path: Path):
+    asked, told = Workspace(tmp_path), list[str | None]()
+    (tmp_path / ".lock.pid").write_text("1\n")  # as a killed process leaves it
+    threads = [Thread(target=lambda: told.extend(asked.running() for _ in range(300))) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert told == [None] * 1200
 
 
 def test_clean_takes_only_what_is_named_by_a_key(tmp_path: Path):

@@ -1,4 +1,4 @@
-"""The page of a training at work, in a browser."""
+"""The page of a running training, in a browser."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.engine.run_file import RunFile, write
+from pipeline.view import redirect_file
+from tests.pipeline.view.running_training import KEYS, RunningTraining
 from tests.pipeline.view.test_server import Served
-from tests.pipeline.view.training_at_work import TrainingAtWork
 from tests.stages.viewer.browser import Viewer, chromium
 
 
@@ -19,7 +21,7 @@ def browser() -> Iterator[Any]:
 
 
 def test_it_follows_a_training_to_the_end_it_asks_for(browser: Any, tmp_path: Path) -> None:
-    with TrainingAtWork(tmp_path) as training:
+    with RunningTraining(tmp_path) as training:
         server = Served(training.root)
         page = Viewer(browser, server.server.url)
         page.until("follower.shown && viewer.renderer.isDone")
@@ -34,13 +36,40 @@ def test_it_follows_a_training_to_the_end_it_asks_for(browser: Any, tmp_path: Pa
         assert page.run("document.getElementById('live-phase').textContent").startswith("Finished")
         assert page.run("document.getElementById('finish').hidden")
         assert np.ptp(page.shown()) > 100
-        server.close()
         assert page.faults == []
+        page.run("window.before = true")
+        write(training.root, RunFile(keys=KEYS | {"train": "e" * 64}))
+        page.until("!window.before && window.follower?.state?.phase === 'waiting'")  # another training was begun
+        server.close()
         page.close()
 
 
+def test_what_cannot_be_drawn_is_no_end_of_the_server(browser: Any, tmp_path: Path) -> None:
+    with RunningTraining(tmp_path) as training:
+        server = Served(training.root)
+        page = Viewer(browser, server.server.url)
+        page.until("follower.shown")
+        page.run("() => { viewer.replace = () => { throw new TypeError('broken'); }; }")
+        page.until("document.getElementById('message').textContent.includes('broken')")
+        step = page.run("follower.state.step")
+        page.until(f"follower.state.step > {step}")
+        assert page.run("document.getElementById('live-phase').textContent").startswith("Training")
+        page.close()
+        server.close()
+
+
+def test_a_file_opens_the_page(browser: Any, tmp_path: Path) -> None:
+    server = Served(RunningTraining(tmp_path).root)
+    page = browser.new_page()
+    page.goto(redirect_file(server.server.url, tmp_path).as_uri())
+    page.wait_for_url(server.server.url)
+    page.wait_for_function("document.getElementById('live-phase').textContent.includes('No training')")
+    page.close()
+    server.close()
+
+
 def test_it_says_when_its_server_is_gone(browser: Any, tmp_path: Path) -> None:
-    server = Served(TrainingAtWork(tmp_path).root)
+    server = Served(RunningTraining(tmp_path).root)
     page = Viewer(browser, server.server.url)
     page.until("document.getElementById('live-phase').textContent.includes('No training')")
     server.close()
@@ -49,7 +78,7 @@ def test_it_says_when_its_server_is_gone(browser: Any, tmp_path: Path) -> None:
 
 
 def test_a_vanilla_training_shows_its_figures(browser: Any, tmp_path: Path) -> None:
-    with TrainingAtWork(tmp_path, field="vanilla") as training:
+    with RunningTraining(tmp_path, field="vanilla") as training:
         server = Served(training.root)
         page = Viewer(browser, server.server.url)
         page.until("follower.cannot")

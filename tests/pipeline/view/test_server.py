@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import math
 import os
 import re
 import signal
@@ -18,11 +19,12 @@ from typing import Any, NamedTuple
 import pytest
 
 from pipeline import view
+from pipeline.engine.run_file import RunFile, write
 from pipeline.view.server import ViewServer, listening
 from stages.train.live import FINISH, LIVE
-from tests.pipeline.view.training_at_work import (
+from tests.pipeline.view.running_training import (
     KEYS,
-    TrainingAtWork,
+    RunningTraining,
     can_reach_other_address,
     quiet_environment,
 )
@@ -77,14 +79,14 @@ class Served:
 
 
 @pytest.fixture(scope="module")
-def at_work(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TrainingAtWork]:
-    with TrainingAtWork(tmp_path_factory.mktemp("work")) as training:
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningTraining]:
+    with RunningTraining(tmp_path_factory.mktemp("work")) as training:
         yield training
 
 
 @pytest.fixture
-def served(at_work: TrainingAtWork) -> Iterator[Served]:
-    server = Served(at_work.root)
+def served(running: RunningTraining) -> Iterator[Served]:
+    server = Served(running.root)
     yield server
     server.close()
 
@@ -95,7 +97,7 @@ def parts_of(body: bytes) -> tuple[dict[str, Any], Callable[[str], bytes]]:
     return header, lambda name: body[4 + length + header["sections"][name][0] :][: header["sections"][name][1]]
 
 
-def test_it_shows_the_field_of_a_training_at_work(served: Served) -> None:
+def test_it_shows_the_field_of_a_running_training(served: Served) -> None:
     told = served.until(lambda told: told["field"])
     assert told["phase"] == "training" and 0 < told["progress"] < 1 and not told["finishing"]
     header, section = parts_of(served.ask(f"field/{told['field']}").body)
@@ -141,14 +143,16 @@ def test_a_page_of_another_origin_is_refused(served: Served) -> None:
     for site in ("cross-site", "same-site"):
         assert served.ask(Sec_Fetch_Site=site).status == 403
     assert served.ask(Sec_Fetch_Site="same-origin").status == 200
+    link = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Dest": "document"}  # as from the file that opens the browser
+    assert served.ask("", **link).status == 200 and served.ask("state", **link).status == 403
     assert served.ask("finish", "POST").status == 403, "whoever cannot say where he comes from"
     assert served.ask("finish", "POST", Origin="http://evil.com").status == 403
 
 
-def test_nothing_but_the_pages_own_is_served(served: Served, at_work: TrainingAtWork) -> None:
+def test_nothing_but_the_pages_own_is_served(served: Served, running: RunningTraining) -> None:
     token = served.server.token
-    (at_work.root / "secret.txt").write_text("secret")
-    paths = ["/", "/state", "/favicon.ico", f"/{token}", f"/{token}/../", f"/{token[:-1]}x/state", "/wrong/state"]
+    (running.root / "secret.txt").write_text("secret")
+    paths = ["/", "/state", "/favicon.ico", f"/{token}", f"/{token}/../", f"/{token[1:]}/state", "/wrong/state"]
     paths += [
         f"/{token}/{up}{file}"
         for up in ("../", "%2e%2e/", "..%2f", "field/../", "field/%2e%2e%2f")
@@ -169,7 +173,7 @@ def test_nothing_but_the_pages_own_is_served(served: Served, at_work: TrainingAt
         served.ask("finish").status == 405
         and served.ask("state", "POST", Origin=f"http://127.0.0.1:{served.server.port}").status == 405
     )
-    assert not (at_work.partial / LIVE / FINISH).exists()
+    assert not (running.partial / LIVE / FINISH).exists()
 
 
 def test_tokens_cannot_be_guessed(tmp_path: Path) -> None:
@@ -194,6 +198,42 @@ def test_a_taken_port_is_refused() -> None:
     taken.close()
 
 
+@pytest.mark.skipif(os.name != "posix", reason="elsewhere the option would share the port with others")
+def test_a_port_is_free_when_its_server_has_ended() -> None:
+    before = listening(None)
+    port = before.getsockname()[1]
+    client = socket.create_connection(("127.0.0.1", port), timeout=30)
+    before.accept()[0].close()  # the server first: its end of the connection lingers
+    assert client.recv(1) == b""
+    client.close()
+    before.close()
+    listening(port).close()
+
+
+def test_the_current_folder_holds_no_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "uvicorn.py").write_text("raise SystemExit")
+    monkeypatch.chdir(tmp_path)
+    with view.serve_during(tmp_path / "w.nerf") as url:
+        assert url.startswith("http://127.0.0.1:")
+
+
+def test_a_server_that_says_nothing_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(view, "COMMAND", ["-c", """import time; time.sleep(3); print('{"url": "late"}')"""])
+    monkeypatch.setattr(view, "START_SECONDS", 0.5)
+    with refused("pipeline.view-ended", "0 s"), view.serve_during(tmp_path):
+        pass
+
+
+def test_the_browser_is_told_the_address_in_private(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DISPLAY", ":0")
+    opened: list[str] = []
+    monkeypatch.setattr(view.webbrowser, "open", opened.append)
+    view.open_browser("http://127.0.0.1:1/token/", tmp_path / "w.nerf")
+    file = Path(opened[0].removeprefix("file://"))
+    assert "token" not in opened[0] and "url=http://127.0.0.1:1/token/" in file.read_text()
+    assert file.parent == tmp_path / "w.nerf" and (os.name != "posix" or file.stat().st_mode & 0o777 == 0o600)
+
+
 def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(view, "find_spec", lambda name: None if name == "uvicorn" else object())
     with refused("pipeline.view-not-installed", "uvicorn", "pipeline-nerf[view]"):
@@ -201,7 +241,7 @@ def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_two_servers_show_one_training_to_its_end(tmp_path: Path) -> None:
-    with TrainingAtWork(tmp_path) as training:
+    with RunningTraining(tmp_path) as training:
         one, two = Served(training.root), Served(training.root)
         for server in (one, two):
             told = server.until(lambda told: told["field"] and told["step"] > 500)
@@ -219,9 +259,9 @@ def test_two_servers_show_one_training_to_its_end(tmp_path: Path) -> None:
 
 
 def test_without_a_training_it_says_so(tmp_path: Path) -> None:
-    training = TrainingAtWork(tmp_path)
+    training = RunningTraining(tmp_path)
     server = Served(training.root)
-    assert server.ask().told == {"phase": "stopped", "field": None}
+    assert server.ask().told == {"phase": "stopped", "key": KEYS["train"], "field": None}
     assert server.ask("scene").status == 204
     assert server.ask("finish", "POST", Origin=f"http://127.0.0.1:{server.server.port}").told == {"asked": False}
     with training.workspace:
@@ -229,8 +269,23 @@ def test_without_a_training_it_says_so(tmp_path: Path) -> None:
     server.close()
 
 
+def test_a_finished_page_is_served_where_nothing_runs(tmp_path: Path) -> None:
+    with RunningTraining(tmp_path, steps=60) as training:
+        server = Served(training.root)
+        training.wait()
+        training.make_page("all of it")
+        assert server.ask().told["phase"] == "finished" and b"follow();" in server.ask("").body, "a run may train anew"
+    assert server.ask("").body == b"all of it"
+    assert server.ask("field/finished").status == 200 and math.isfinite(server.server.served_last)
+    write(training.root, RunFile(keys=KEYS | {"normalise": "f" * 64}))
+    told = server.ask().told
+    assert (told["phase"], told["field"]) == ("stopped", None), "a field of another scene"
+    assert server.server.served_last == math.inf and b"follow();" in server.ask("").body
+    server.close()
+
+
 def test_ctrl_c_ends_the_command_and_leaves_the_training_alone(tmp_path: Path) -> None:
-    with TrainingAtWork(tmp_path) as training:
+    with RunningTraining(tmp_path) as training:
         words = [sys.executable, "-m", "pipeline", "view", str(training.root), "--json"]
         command = subprocess.Popen(
             words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=quiet_environment()
@@ -251,12 +306,12 @@ def test_ctrl_c_ends_the_command_and_leaves_the_training_alone(tmp_path: Path) -
         assert training.thread.is_alive(), training.error
 
 
-def test_a_server_beside_a_run_ends_with_it(tmp_path: Path) -> None:
+def test_a_server_during_a_run_ends_with_it(tmp_path: Path) -> None:
     lines = (
         "import time",
         "from pathlib import Path",
-        "from pipeline.view import beside",
-        f"with beside(Path({str(tmp_path)!r})) as url:",
+        "from pipeline.view import serve_during",
+        f"with serve_during(Path({str(tmp_path)!r})) as url:",
         "    print(url, flush=True)",
         "    time.sleep(600)",
     )

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from nerf.training.schedule import DECAY_START_PROGRESS
+from nerf.training.trainer import NonFinite
 from stages.train import live, loop
 from stages.train.live import FINISH, LIVE, STATE, LiveFolder, ask_to_finish, touch
 from stages.train.loop import TrainingRun
@@ -32,8 +33,8 @@ def watchable(
 
 @pytest.fixture(autouse=True)
 def short_times(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A look before every step, and a health that is known early."""
-    monkeypatch.setattr(live, "LOOK_SECONDS", 0.0)
+    """A poll before every step, and a health that is known early."""
+    monkeypatch.setattr(live, "POLL_SECONDS", 0.0)
     monkeypatch.setattr(loop, "MIN_HEALTHY_STEPS", 60)
 
 
@@ -72,12 +73,24 @@ def test_fields_cost_at_most_their_fraction_of_the_time(tmp_path: Path, monkeypa
     assert 2 <= spent <= 6 and len([path for path in folder.root.iterdir() if path.is_dir()]) == live.KEPT
 
 
-def test_a_full_disk_ends_no_training(tmp_path: Path) -> None:
+def test_a_full_disk_ends_no_training_and_fills_no_further(tmp_path: Path) -> None:
+    tried: list[Path] = []
+
     def full(folder: Path) -> None:
+        tried.append(folder)
+        (folder / "field.safetensors").write_bytes(b"half")
         raise OSError(28, "No space left on device")
 
-    LiveFolder(tmp_path, full).show({"step": 1})
-    assert not (tmp_path / LIVE / STATE).exists()
+    folder = LiveFolder(tmp_path, full)
+    for step in (1, 2, 3):
+        folder.show({"step": step})
+    assert len(tried) == 1 and not tried[0].exists(), "the next one is not due at once"
+    assert json.loads((tmp_path / LIVE / STATE).read_text()) == {"step": 3, "field": None}
+
+
+def test_what_cannot_be_touched_is_not_watched(tmp_path: Path) -> None:
+    (tmp_path / LIVE).write_text("a file")
+    assert not touch(tmp_path) and not ask_to_finish(tmp_path)
 
 
 def test_a_figure_that_is_not_finite_ends_no_training(tmp_path: Path) -> None:
@@ -120,6 +133,20 @@ def test_a_request_waits_until_the_field_can_be_judged(tmp_path: Path, progress)
     run = watchable(tmp_path, progress, asked_at(tmp_path, 2))
     run.train()
     assert run.state.step == round(60 / DECAY_START_PROGRESS)
+
+
+def test_a_request_waits_after_a_roll_back(tmp_path: Path, progress) -> None:
+    """For the step of the latest revision, from which alone a schedule can be revised."""
+
+    def trouble(step: int, lr_scale: float) -> None:
+        if step == 100 and lr_scale == 1:
+            run.schedule = run.schedule.revised(step, STEPS - 100, 0.25)
+            ask_to_finish(tmp_path)
+            raise NonFinite("loss", step, {})
+
+    run = watchable(tmp_path, progress, trouble)
+    run.train()
+    assert run.schedule.revisions[-1].from_step == 100 and run.state.step == round(100 / DECAY_START_PROGRESS)
 
 
 @pytest.mark.parametrize("budget", [TrainingBudget(STEPS, None), TrainingBudget(None, 60.0)])

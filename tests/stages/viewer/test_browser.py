@@ -118,6 +118,17 @@ def test_a_path_is_played_back_from_key_to_key(ball: Viewer):
     ball.until("!viewer.navigation.flight")
 
 
+def test_of_the_fields_before_nothing_is_kept(ball: Viewer):
+    replaced = """() => {
+      const asked = [], { field, views } = viewer.contents, section = (n) => () => void asked.push(n);
+      for (const n of [1, 2, 3]) viewer.replace({ field, gains: views.map(() => ({})), section: section(n) });
+      asked.length = 0;
+      viewer.contents.section("palette");
+      return asked;
+    }"""
+    assert ball.run(replaced) == [3]
+
+
 def test_a_photo_beside_its_render_scores_as_in_python(browser: Any, tmp_path: Path):
     inputs, scene = photographed(tmp_path, channels=4)
     for name in ("train", "scale", "viewer"):

@@ -20,23 +20,26 @@ from tests.conftest import SilentProgress
 from tests.stages.photo_scene import photographed
 from tests.stages.viewer.made_fields import NAMES
 
-KEYS = {name: f"{number:064x}" for number, name in enumerate(("ingest", "normalise", "effects", "scale", "train"), 1)}
+KEYS = {
+    name: f"{number:064x}"
+    for number, name in enumerate(("ingest", "normalise", "effects", "scale", "train", "viewer"), 1)
+}
 GRID: dict[str, Any] = {"num_levels": 2, "log2_hashmap_size": 10, "max_res": 32, "target_samples": 1024}
 MANY_STEPS = 1_000_000
 
 
-def manifest_of(stage: str, folder: Path, result: StageResult) -> Manifest:
-    """Of ``result`` in ``folder``."""
+def manifest_of(stage: str, folder: Path, result: StageResult, inputs: dict[str, str] | None = None) -> Manifest:
+    """Of ``result`` in ``folder``, made of ``inputs``: the digest of each stage's outputs."""
     outputs, records = (manifests.describe_outputs(folder, names) for names in (result.outputs, result.records))
     digest = manifests.outputs_digest(outputs)
-    return Manifest(stage, 1, KEYS[stage], {}, {}, outputs, digest, records, result.facts, "", 1.0, "")
+    return Manifest(stage, 1, KEYS[stage], {}, inputs or {}, outputs, digest, records, result.facts, "", 1.0, "")
 
 
 class Over(BaseException):
     """The test is."""
 
 
-class TrainingAtWork:
+class RunningTraining:
     """``root`` is its workspace, which it holds locked as a run does. Photos have names that break careless pages."""
 
     def __init__(self, folder: Path, steps: int = MANY_STEPS, field: str = "grid") -> None:
@@ -60,7 +63,7 @@ class TrainingAtWork:
         self.error: BaseException | None = None
         self.over = False
 
-    def __enter__(self) -> "TrainingAtWork":
+    def __enter__(self) -> "RunningTraining":
         self.workspace.__enter__()
         self.partial.mkdir(parents=True, exist_ok=True)
         self.thread.start()
@@ -80,10 +83,22 @@ class TrainingAtWork:
             trainer.step = step_unless_over  # pyright: ignore[reportAttributeAccessIssue]
             training.compute(loaded)
             result = training.save(loaded, self.partial, SilentProgress())
-            manifest = manifest_of("train", self.partial, result)
-            self.workspace.finish(self.partial, self.workspace.folder("train", KEYS["train"]), manifest)
+            self._finish("train", self.partial, result, "normalise")
         except BaseException as error:
             self.error = error
+
+    def _finish(self, stage: str, partial: Path, result: StageResult, of: str) -> None:
+        """As the runner does, of the outputs of one other stage."""
+        inputs = {of: manifests.read(self.workspace.folder(of, KEYS[of])).outputs_digest}
+        finished = self.workspace.folder(stage, KEYS[stage])
+        self.workspace.finish(partial, finished, manifest_of(stage, partial, result, inputs))
+
+    def make_page(self, text: str) -> None:
+        """What stage viewer makes of the finished training."""
+        partial = self.workspace.partial("viewer", KEYS["viewer"])
+        partial.mkdir(parents=True)
+        (partial / "viewer.html").write_text(text)
+        self._finish("viewer", partial, StageResult(("viewer.html",), ""), "train")
 
     def wait(self) -> None:
         """Until it has ended."""
