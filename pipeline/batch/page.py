@@ -6,7 +6,6 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image
@@ -37,7 +36,7 @@ def write_page(folder: Path, batch: BatchFile) -> None:
         count=len(scenes),
         spent=sum(scene.spent for _, scene in scenes),
         ranked=[_entry(folder, name, scene) for name, scene in sorted(done, key=lambda pair: -_rank(pair[1]))],
-        failed=[(name, scene, quote(f"{name}.log")) for name, scene in scenes if scene.state == "failed"],
+        failed=[(name, scene, f"{name}.log") for name, scene in scenes if scene.state == "failed"],
         waiting=[(name, scene.state) for name, scene in scenes if scene.state in ("waiting", "running")],
     )
     write_durably(folder / PAGE, page.encode())
@@ -50,7 +49,7 @@ def _rank(scene: SceneState) -> float:
 
 def _entry(folder: Path, name: str, scene: SceneState) -> dict[str, Any]:
     output = folder / f"{name}.nerf" / "output"
-    found = {words: quote(f"{name}.nerf/output/{file}") for file, words in LINKED.items() if (output / file).exists()}
+    found = {words: f"{name}.nerf/output/{file}" for file, words in LINKED.items() if (output / file).exists()}
     return {"name": name, "scene": scene, "links": found, "picture": _picture(output / "renders")}
 
 

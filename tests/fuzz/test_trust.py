@@ -36,6 +36,7 @@ UNPICKLE = {
     "numpy.load",
 }
 UNPICKLE |= {"allow_pickle", "yaml.load", "runpy"}
+SERVES = {"pipeline/view/server.py": {"socket"}}  # at this machine's own address alone
 CONNECT = {"socket", "urllib", "http", "requests", "ftplib", "smtplib", "aiohttp", "httpx", "huggingface_hub"}
 
 
@@ -53,7 +54,8 @@ def called_and_imported(path: Path) -> set[str]:
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_nothing_runs_code_unpickles_or_connects(path: Path) -> None:
-    assert not called_and_imported(path) & (RUN_CODE | UNPICKLE | CONNECT)
+    allowed = SERVES.get(path.relative_to(ROOT).as_posix(), set())
+    assert not called_and_imported(path) & (RUN_CODE | UNPICKLE | CONNECT) - allowed
 
 
 def test_that_test_sees_what_it_looks_for(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -213,7 +214,10 @@ def test_a_scene_ends_with_its_batch(scenes: Path, tmp_path: Path, signal_number
     )
     path = os.pathsep.join((str(slow.parent), str(Path(__file__).parents[3])))
     command = [sys.executable, "-m", "pipeline", "batch", str(scenes), "-o", str(out), *ONLY_INGEST]
-    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}, stderr=subprocess.PIPE, text=True)
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs begin with it ignored
+    process = subprocess.Popen(
+        command, env={**os.environ, "PYTHONPATH": path}, stderr=subprocess.PIPE, text=True, preexec_fn=heard
+    )
     wait_until(lambda: seen.exists() and seen.read_text())
     child = int(seen.read_text())
     assert alive(child)

@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -287,9 +288,9 @@ def test_a_finished_page_is_served_where_nothing_runs(tmp_path: Path) -> None:
 def test_ctrl_c_ends_the_command_and_leaves_the_training_alone(tmp_path: Path) -> None:
     with RunningTraining(tmp_path) as training:
         words = [sys.executable, "-m", "pipeline", "view", str(training.root), "--json"]
-        command = subprocess.Popen(
-            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=quiet_environment()
-        )
+        pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs begin with it ignored
+        command = subprocess.Popen(words, env=quiet_environment(), preexec_fn=heard, **pipes)
         assert command.stdout is not None
         port = int(re.findall(r":(\d+)/", json.loads(command.stdout.readline())["url"])[0])
         ends = time.monotonic() + WAIT_SECONDS

@@ -85,7 +85,7 @@ def scene_around(count=12):
         split = "test" if number % 8 == 0 else "train"
         views.append(View(f"{number}.jpg", f"images/{number}.png", 0, pose, 1.0, 6.0, split))
     camera = Camera("SIMPLE_RADIAL", 80, 60, (75.0, 40.0, 30.0, 0.02))
-    return Scene((camera,), tuple(views), SCENE_FROM_SFM, True, False, "object-centric", True)
+    return Scene((camera,), tuple(views), SCENE_FROM_SFM, True, True, "object-centric", True)
 
 
 @pytest.fixture
