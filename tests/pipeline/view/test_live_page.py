@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from pipeline.engine.run_file import RunFile, write
-from pipeline.view import redirect_file
 from tests.pipeline.view.running_training import KEYS, RunningTraining
 from tests.pipeline.view.test_server import Served
-from tests.stages.viewer.browser import WAIT_SECONDS, Viewer, chromium
+from tests.stages.viewer.browser import Viewer, chromium
 
 
 @pytest.fixture(scope="module")
@@ -58,17 +57,6 @@ def test_what_cannot_be_drawn_is_no_end_of_the_server(browser: Any, tmp_path: Pa
         assert page.run("document.getElementById('live-phase').textContent").startswith("Training")
         page.close()
         server.close()
-
-
-def test_a_file_opens_the_page(browser: Any, tmp_path: Path) -> None:
-    server = Served(RunningTraining(tmp_path).root)
-    page = browser.new_page()
-    page.set_default_timeout(1000 * WAIT_SECONDS)
-    page.goto(redirect_file(server.server.url, tmp_path).as_uri())
-    page.wait_for_url(server.server.url)
-    page.get_by_text("No training is running").wait_for(state="attached")
-    page.close()
-    server.close()
 
 
 def test_it_says_when_its_server_is_gone(browser: Any, tmp_path: Path) -> None:
