@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from tests.pipeline.view.running_training import RunningTraining
@@ -16,27 +15,6 @@ from tests.stages.viewer.browser import Viewer, chromium
 def browser() -> Iterator[Any]:
     with chromium() as running:
         yield running
-
-
-def test_it_follows_a_training_to_the_end_it_asks_for(browser: Any, tmp_path: Path) -> None:
-    with RunningTraining(tmp_path) as training:
-        server = Served(training.root)
-        page = Viewer(browser, server.server.url)
-        page.until("follower.shown && viewer.renderer.isDone")
-        first, field = page.shown(), page.run("follower.shown")
-        assert page.run("document.querySelectorAll('b').length") == 0, "a name is text and no HTML"
-        page.until(f"follower.shown !== '{field}' && document.querySelector('#live-curve polyline')")
-        assert np.abs(page.shown() - first).max() > 10
-        page.until("follower.state.step > 500")
-        page.run("document.getElementById('finish').click()")
-        training.wait()
-        page.until("follower.shown === 'finished'")
-        assert page.run("document.getElementById('live-phase').textContent").startswith("Finished")
-        assert page.run("document.getElementById('finish').hidden")
-        assert np.ptp(page.shown()) > 100
-        assert page.faults == []
-        server.close()
-        page.close()
 
 
 def test_it_says_when_its_server_is_gone(browser: Any, tmp_path: Path) -> None:
