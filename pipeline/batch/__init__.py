@@ -41,7 +41,7 @@ class Batch:
         return self.folder / f"{name}.log"
 
 
-def check_same_folder(folder: Path, scenes: Path) -> str | None:
+def other_folder(folder: Path, scenes: Path) -> str | None:
     """The other folder of scenes, still there, that the batch in ``folder`` was made from; None where there is none."""
     before = batch_file.read(folder).folder
     same = not before or not os.path.isdir(before) or os.path.realpath(before) == os.path.realpath(scenes)

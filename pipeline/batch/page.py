@@ -1,18 +1,16 @@
 """index.html of a batch: its scenes ranked by PSNR, each with a picture, and what failed with the reason."""
 
-import base64
-import io
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image
 
 from pipeline.batch.batch_file import BatchFile, SceneState
 from stages.io.amounts import duration
 from stages.io.files import write_durably
+from stages.report.html import jpeg_uri, templates
 
 PAGE = "index.html"
 PICTURE_PX = 360
@@ -21,13 +19,7 @@ LINKED = {"viewer.html": "viewer", "report.html": "report", "mesh.glb": "mesh", 
 
 def write_page(folder: Path, batch: BatchFile) -> None:
     """Write the page of the batch in ``folder``, whose workspaces lie beside it. Raises OSError."""
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = templates(Path(__file__).parent)
     environment.filters["duration"] = duration
     scenes = list(batch.scenes.items())
     done = [(name, scene) for name, scene in scenes if scene.state == "done"]
@@ -66,6 +58,4 @@ def _shrunk(file: Path, changed_ns: int) -> str:
     """``changed_ns`` tells a new picture under an old name; the page is written twice for each scene."""
     with Image.open(file) as image:
         image.thumbnail((PICTURE_PX, PICTURE_PX))
-        small = io.BytesIO()
-        image.convert("RGB").save(small, "JPEG", quality=85)
-    return f"data:image/jpeg;base64,{base64.b64encode(small.getvalue()).decode()}"
+        return jpeg_uri(image.convert("RGB"))

@@ -183,11 +183,11 @@ def command_batch(words: Sequence[str]) -> int:
     last = _known_stage(given.until or list(stage_list.STAGES)[-1], "--until")
     _check_budget(budget, stage_list.up_to(last, dict(settings)), given.until, "WORKSPACE")
     check_fitted_poses(settings)
-    from pipeline.batch import Batch, check_same_folder, run_batch
+    from pipeline.batch import Batch, other_folder, run_batch
     from pipeline.batch.scenes import find_scenes
 
     folder = given.output or Path.cwd() / f"{given.scenes.absolute().name}.batch"
-    if given.output is None and (other := check_same_folder(folder, given.scenes)):
+    if given.output is None and (other := other_folder(folder, given.scenes)):
         raise UsageError(f"{folder.name} was made from {other}, not from {given.scenes}; give another folder with -o")
     batch = Batch(given.scenes, find_scenes(given.scenes), folder, _options_of_each(words[1:]), budget)
     with choose_display(given.common.json) as display:

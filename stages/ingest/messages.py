@@ -131,20 +131,25 @@ def excluded_by_values(files: Sequence[str]) -> list[Note]:
     """A note on files among colour photos whose values are those of depth maps."""
     if not files:
         return []
-    count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
-    named = listed([shown(name) for name in files], 3)
-    words = f"{count} excluded as depth maps, with grey values of 16 bits or floats among colour photos: {named}"
-    return [Note("ingest.depth-maps", words)]
+    words = f"{_count(files)} excluded as depth maps, with grey values of 16 bits or floats among colour photos"
+    return [Note("ingest.depth-maps", f"{words}: {_first_names(files)}")]
 
 
 def excluded_masks(files: Sequence[str]) -> list[Note]:
     """A note on files among photos that are black and white alone."""
     if not files:
         return []
-    count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
-    named = listed([shown(name) for name in files], 3)
-    words = f"{count} excluded as masks, black and white among photos: {named}. To use masks, whose black is ignored"
-    return [Note("ingest.black-and-white", f"{words}, name them masks/NAME.png after their photos")]
+    words = f"{_count(files)} excluded as masks, black and white among photos: {_first_names(files)}"
+    how = "To use masks, whose black is ignored, name them masks/NAME.png after their photos"
+    return [Note("ingest.black-and-white", f"{words}. {how}")]
+
+
+def _count(files: Sequence[str]) -> str:
+    return "1 file is" if len(files) == 1 else f"{len(files)} files are"
+
+
+def _first_names(files: Sequence[str]) -> str:
+    return listed([shown(name) for name in files], 3)
 
 
 def bracketed(brackets: Brackets) -> str:

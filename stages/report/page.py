@@ -1,7 +1,6 @@
 """The page of the report and summary.json: what the finished stages left, and one function per part of the page."""
 
 import base64
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -9,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
@@ -32,6 +30,7 @@ from stages.report.cameras import (
     uncertainty,
 )
 from stages.report.effects import effects_table
+from stages.report.html import data_uri, jpeg_uri, templates
 from stages.report.plots import ORDER_COLOURS, Score, camera_svgs, curve_svg, falloff_svg
 from stages.report.profile import profile_bar
 from stages.scale.lengths import length_in_words
@@ -128,13 +127,7 @@ def _expected(manifests: Mapping[str, dict[str, Any]]) -> dict[str, float]:
 
 def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
     """The whole HTML page."""
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = templates(Path(__file__).parent)
     environment.filters |= {
         "duration": duration,
         "short": short_count,
@@ -190,7 +183,7 @@ def _mesh_part(results: Results) -> dict[str, Any]:
     preview = results.inputs["mesh"] / "preview.png" if "mesh" in results.inputs else None
     files = results.manifests.get("mesh", {}).get("outputs", ())
     return {
-        "mesh_preview": _data_uri(preview.read_bytes(), "image/png") if preview and preview.exists() else None,
+        "mesh_preview": data_uri(preview.read_bytes(), "image/png") if preview and preview.exists() else None,
         "mesh_files": [name for name in files if name not in ("preview.png", SMALL_COPY)],
         "turntable": _turntable(results),
         "turntable_script": Markup(Path(__file__).with_name("turntable.js").read_text("utf-8")),
@@ -267,7 +260,7 @@ def _thumbnail(path: Path) -> str | None:
         return None
     with pillow().open(path) as picture:
         picture.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
-        return _jpeg_uri(Image.fromarray(_opaque(np.asarray(picture), 255)))
+        return jpeg_uri(Image.fromarray(_opaque(np.asarray(picture), 255)))
 
 
 def _video(inputs: Inputs, limit_mb: float) -> str | None:
@@ -275,7 +268,7 @@ def _video(inputs: Inputs, limit_mb: float) -> str | None:
     if "render" not in inputs:
         return None
     video = inputs["render"] / "video.mp4"
-    return _data_uri(video.read_bytes(), "video/mp4") if video.stat().st_size < limit_mb * 1e6 else "video.mp4"
+    return data_uri(video.read_bytes(), "video/mp4") if video.stat().st_size < limit_mb * 1e6 else "video.mp4"
 
 
 def _cameras(results: Results) -> dict[str, Any] | None:
@@ -326,7 +319,7 @@ def _study(results: Results) -> dict[str, Any] | None:
         "rendering": rendering_sentence(results.study["points"]),
         "rows": [{"cells": table_cells(row), "front": row["pareto_front"]} for row in results.study["points"]],
         "field_is_older": field and train and field["train"] != train.resolve().name,
-        "sheet": _data_uri(ablation.read_bytes(), "image/png") if ablation.exists() else None,
+        "sheet": data_uri(ablation.read_bytes(), "image/png") if ablation.exists() else None,
     }
 
 
@@ -366,7 +359,7 @@ def _pictures(results: Results, image: dict[str, Any], width: int) -> dict[str, 
     photo = Image.fromarray(_opaque(load_pixels(results.inputs["ingest"] / view.file, *size), background))
     pictures = {"photo": photo, "render": render.resize(size, Image.Resampling.BOX), "error": error.resize(size)}
     aspect = round(size[0] / size[1], 4)
-    return image | {"aspect": aspect} | {name: _jpeg_uri(picture) for name, picture in pictures.items()}
+    return image | {"aspect": aspect} | {name: jpeg_uri(picture) for name, picture in pictures.items()}
 
 
 def _opaque(pixels: np.ndarray, background: int) -> np.ndarray:
@@ -375,16 +368,6 @@ def _opaque(pixels: np.ndarray, background: int) -> np.ndarray:
         return pixels
     alpha = pixels[..., 3:] / 255
     return np.rint(pixels[..., :3] * alpha + background * (1 - alpha)).astype(np.uint8)
-
-
-def _jpeg_uri(picture: Image.Image) -> str:
-    buffer = io.BytesIO()
-    picture.save(buffer, "JPEG", quality=88)
-    return _data_uri(buffer.getvalue(), "image/jpeg")
-
-
-def _data_uri(content: bytes, media_type: str) -> str:
-    return f"data:{media_type};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def _value(value: Any) -> str:

@@ -105,16 +105,18 @@ def _most_steps(
     of the first one held, if that makes it longer: where a photo sees one plane, a pair alone tells neither its pose
     nor its camera (docs/experiments/match_graph.md)."""
 
-    def length(model: Any) -> int:
-        return longest_supported(model, state.database, trusted)
+    def ranked(models: list[Any]) -> tuple[list[Any], int]:
+        lengths = [longest_supported(model, state.database, trusted) for model in models]
+        order = sorted(range(len(models)), key=lambda number: lengths[number], reverse=True)
+        return [models[number] for number in order], max(lengths, default=0)
 
-    found = sorted(found, key=length, reverse=True)
-    if state.job.camera_params is not None or length(found[0]) < MIN_PHOTOS_OF_CAMERA:
+    found, length = ranked(found)
+    if state.job.camera_params is not None or length < MIN_PHOTOS_OF_CAMERA:
         return found
     adopt_cameras(matches, found[0])
     options = incremental_options(state.job.seed, mapping, camera_is_known=True, thinned=state.thinned)
-    again = sorted(_map_incrementally(matches, options, state), key=length, reverse=True)
-    return again if again and length(again[0]) > length(found[0]) else found
+    again, longer = ranked(_map_incrementally(matches, options, state))
+    return again if longer > length else found
 
 
 def _comparison(model: Any, other: Any, checks: Sequence[Candidate], database: Path, state: JobState) -> dict[str, Any]:
