@@ -131,17 +131,18 @@ def excluded_by_values(files: Sequence[str]) -> list[Note]:
     """A note on files among colour photos whose values are those of depth maps."""
     if not files:
         return []
-    words = f"{_count(files)} excluded as depth maps, with grey values of 16 bits or floats among colour photos"
-    return [Note("ingest.depth-maps", f"{words}: {_first_names(files)}")]
+    count, named = _count(files), _first_names(files)
+    words = f"{count} excluded as depth maps, with grey values of 16 bits or floats among colour photos: {named}"
+    return [Note("ingest.depth-maps", words)]
 
 
 def excluded_masks(files: Sequence[str]) -> list[Note]:
     """A note on files among photos that are black and white alone."""
     if not files:
         return []
-    words = f"{_count(files)} excluded as masks, black and white among photos: {_first_names(files)}"
-    how = "To use masks, whose black is ignored, name them masks/NAME.png after their photos"
-    return [Note("ingest.black-and-white", f"{words}. {how}")]
+    count, named = _count(files), _first_names(files)
+    words = f"{count} excluded as masks, black and white among photos: {named}. To use masks, whose black is ignored"
+    return [Note("ingest.black-and-white", f"{words}, name them masks/NAME.png after their photos")]
 
 
 def _count(files: Sequence[str]) -> str:
