@@ -54,7 +54,14 @@ def _panel(axes: Any, scene: str, ours: Sequence[Figures], others: Sequence[dict
             axes.axhline(row["paper_psnr"], color=OTHER, lw=1, ls="--")
             place = {"xycoords": axes.get_yaxis_transform(), "textcoords": "offset points"}
             axes.annotate(
-                row["method"], (0.01 + 0.2 * (index % 5), row["paper_psnr"]), (0, 2), size=9, color=OTHER, **place
+                row["method"],
+                (0.01 + 0.2 * (index % 5), row["paper_psnr"]),
+                (0, 0),
+                size=9,
+                color=OTHER,
+                va="center",
+                bbox={"facecolor": "#ffffff", "edgecolor": "none", "pad": 1},  # over the lines of others beside it
+                **place,
             )
     _set_axes(axes, [row["seconds"] for row in (*ours, *others) if row["seconds"]])
     axes.set_title("; ".join(filter(None, (scene, ours[0]["deviates"]))), size=9, loc="left", wrap=True)
