@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 # Of a pyramid, in photos: in a wider one cells are coarser than the contraction's, whose cube has the region of
 # interest in 0.45 of its width (docs/experiments/forward_facing.md).
 MAX_WIDTH = 2.0
+# How many times as far from the hindmost camera as from its own photo the nearest things may be, in NEAR_SHARE of the
+# photos: before a camera that walked forwards, cells and samples are as many times too coarse.
+MAX_NEAR_RATIO, NEAR_SHARE = 3.0, 0.9
 
 
 def chosen_space(decisions: "Decisions", scene: "Scene") -> tuple["Space", str]:
@@ -34,6 +37,9 @@ def chosen_space(decisions: "Decisions", scene: "Scene") -> tuple["Space", str]:
     spread = f"one frustum {width:.1f} times as wide as a photo's holds the scene"
     if width > MAX_WIDTH:
         return "contracted", f"contracted: the capture is forward-facing, but only {spread}"
+    if (ratio := near_ratio(pyramid, scene)) > MAX_NEAR_RATIO:
+        walked = f"some cameras stand deep in the scene (what is near them would be {ratio:.0f} times too coarse)"
+        return "contracted", f"contracted: the capture is forward-facing, but {walked}"
     return "ndc", f"normalised device coordinates: the capture is forward-facing, and {spread}"
 
 
@@ -69,3 +75,10 @@ def width_in_photos(pyramid: Ndc, scene: "Scene") -> float:
     rays = [border_rays(camera) for camera in scene.cameras]
     own = np.median([np.abs(ray[:, :2] / ray[:, 2:]).max(0) for ray in rays], axis=0)
     return float((np.array(pyramid.slopes) / own).max())
+
+
+def near_ratio(pyramid: Ndc, scene: "Scene") -> float:
+    """How many times as far along the axis from the hindmost camera as from its photo the things at a photo's near
+    distance are: at most so many times in NEAR_SHARE of the photos."""
+    depth = np.stack([view.scene_from_camera[:, 3] for view in scene.views]) @ np.array(pyramid.axes[2])
+    return float(np.quantile(1 + (depth - depth.min()) / [view.near for view in scene.views], NEAR_SHARE))

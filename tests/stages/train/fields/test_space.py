@@ -12,7 +12,7 @@ from stages.effects.decisions import Decisions
 from stages.train.config import Config
 from stages.train.data import camera_directions
 from stages.train.fields.field_list import make_trainer, with_defaults
-from stages.train.fields.space import MAX_WIDTH, chosen_space, space_map_of, width_in_photos
+from stages.train.fields.space import MAX_NEAR_RATIO, MAX_WIDTH, chosen_space, near_ratio, space_map_of, width_in_photos
 from tests.camera_layouts import ring, wall
 from tests.refusals import refused
 
@@ -41,6 +41,13 @@ def fanned(spread_deg: float) -> np.ndarray:
     return poses
 
 
+def walked(length: float) -> np.ndarray:
+    """Eleven cameras that look along +y, one behind the other."""
+    poses = np.repeat(wall()[:1], 11, axis=0)
+    poses[:, 1, 3] += np.linspace(0, length, 11)
+    return poses
+
+
 def test_cameras_that_face_one_way_get_ndc() -> None:
     scene = scene_of(wall())
     space, why = chosen_space(UNBOUNDED, scene)
@@ -59,8 +66,10 @@ def test_cameras_that_face_one_way_get_ndc() -> None:
         (UNBOUNDED, scene_of(fanned(10.0)), "ndc"),
         (UNBOUNDED, scene_of(fanned(30.0)), "contracted"),
         (UNBOUNDED, scene_of(fanned(60.0)), "contracted"),
+        (UNBOUNDED, scene_of(walked(0.5)), "ndc"),
+        (UNBOUNDED, scene_of(walked(5.0)), "contracted"),
     ],
-    ids=["no background", "all round", "a little aside", "too wide", "no pyramid"],
+    ids=["no background", "all round", "a little aside", "too wide", "no pyramid", "a step forwards", "a long walk"],
 )
 def test_the_space_follows_background_and_cameras(decisions: Decisions, scene: Scene, space: str) -> None:
     chosen, why = chosen_space(decisions, scene)
@@ -75,6 +84,16 @@ def test_the_width_decides_between_two_pyramids() -> None:
         assert isinstance(pyramid, Ndc)
         widths.append(width_in_photos(pyramid, scene))
     assert 1 < widths[0] < MAX_WIDTH < widths[1]
+
+
+def test_the_near_ratio_grows_with_the_walk() -> None:
+    """At 0.5 before each photo: the last but one of eleven stands 0.9 of the walk behind the first."""
+    for length in (0.5, 5.0):
+        scene = scene_of(walked(length))
+        pyramid = space_map_of(Config(space="ndc"), scene)
+        assert isinstance(pyramid, Ndc)
+        assert near_ratio(pyramid, scene) == pytest.approx(1 + 0.9 * length / 0.5)
+        assert (near_ratio(pyramid, scene) > MAX_NEAR_RATIO) == (length == 5.0)
 
 
 def test_an_option_forces_a_space() -> None:
