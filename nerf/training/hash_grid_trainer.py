@@ -1,9 +1,9 @@
 """One optimisation step of a hash-grid field (:class:`nerf.training.trainer.FieldTrainer`)."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -98,11 +98,11 @@ class Loss(NamedTuple):
     grad_effects: dict[str, Tensor]
 
 
-class _MicroBatch(NamedTuple):
+class MicroBatch(NamedTuple):
     """What one micro-batch contributes: loss, gradients and their norm, the optical thickness of its samples, and the
-    number of density evaluations."""
+    number of density evaluations. ``batch`` is None of one that another process computed."""
 
-    batch: HashGridBatch
+    batch: HashGridBatch | None
     loss: Tensor
     squared_error: Tensor
     grad_networks: Weights
@@ -113,6 +113,25 @@ class _MicroBatch(NamedTuple):
     grad_norm: Tensor
     optical_thickness: Float[Tensor, "samples"]
     density_evaluations: int
+
+
+@runtime_checkable
+class Exchange(Protocol):
+    """What the processes that share a training's micro-batches have of each other (nerf/training/data_parallel.py)."""
+
+    @property
+    def is_dense(self) -> bool:
+        """Whether the table's gradient is to be added up over the processes, each of which has that of its own
+        micro-batches alone. Known from :meth:`all_micro_batches` on."""
+        ...
+
+    def all_micro_batches(self, step: int, compute: Callable[[int], MicroBatch], count: int) -> list[MicroBatch]:
+        """All ``count`` micro-batches of a step, in order, of which this process computes some."""
+        ...
+
+    def add_up(self, grad_table: Tensor) -> None:
+        """In place: the sum over the processes."""
+        ...
 
 
 def lr_multiplier(step: int, progress: float) -> float:
@@ -158,6 +177,7 @@ class HashGridTrainer:
         self.samples_per_ray = torch.tensor(INITIAL_SAMPLES_PER_RAY, dtype=torch.float64)
         self.pixel_sampler = PixelSampler(self.dataset.unmasked_count, settings.seed, dataset.device)
         self.pixels_sampled = torch.tensor(0)  # so far; steps differ in how many they take
+        self.exchange: Exchange | None = None  # of a training by several processes
 
     def _frustum_mask(self) -> Bool[Tensor, "cells"] | None:
         """Only in unbounded space and with sparse points, which tell where foregrounds begin; else None."""
@@ -170,7 +190,10 @@ class HashGridTrainer:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
         device, count, rays = self.dataset.device, self.settings.micro_batches, self._rays_per_micro_batch()
         compute = partial(self._compute_micro_batch, step, progress, rays)
-        micro_batches = list(in_order(compute, range(count), device))
+        if self.exchange is None:
+            micro_batches = list(in_order(compute, range(count), device))
+        else:
+            micro_batches = self.exchange.all_micro_batches(step, compute, count)
         loss, error = self._check_finite(step, micro_batches)
         self._update(micro_batches, lr_scale * lr_multiplier(step, progress), step + 1)
         with span("occupancy"):
@@ -260,7 +283,7 @@ class HashGridTrainer:
         known = self.dataset.sparse_pixels is not None or self.dataset.depth_maps is not None
         return known and self.settings.depth_weight * depth_loss_multiplier(progress) > 0
 
-    def _compute_micro_batch(self, step: int, progress: float, rays: int, index: int) -> _MicroBatch:
+    def _compute_micro_batch(self, step: int, progress: float, rays: int, index: int) -> MicroBatch:
         """What micro-batch number ``index``, of so many rays, adds to loss and gradients."""
         with span("batch"):
             batch = self._batch(step, progress, index, rays)
@@ -277,7 +300,7 @@ class HashGridTrainer:
             )
             background = {name: self.model.background_backward(forward_pass, gradients) for name in self.background}
         networks, features, *_ = gradients
-        return _MicroBatch(
+        return MicroBatch(
             batch,
             loss.value,
             loss.squared_error,
@@ -321,7 +344,7 @@ class HashGridTrainer:
             grad_weights, grad = grad_weights + more_weights, grad._replace(opacity=grad.opacity + more_opacity)
         return Loss(value, error.square().sum() / (3 * rays), grad, grad_weights, effects)
 
-    def _check_finite(self, step: int, micro_batches: Sequence[_MicroBatch]) -> tuple[float, float]:
+    def _check_finite(self, step: int, micro_batches: Sequence[MicroBatch]) -> tuple[float, float]:
         """Loss and squared error as numbers. Raises NonFinite unless they and all gradients are finite.
 
         The table's gradient is a sum of the features' gradients with weights up to 1: finite if their norm is.
@@ -331,17 +354,22 @@ class HashGridTrainer:
         loss_now, error_now, norm_now = torch.stack([torch.stack(values).sum() for values in each]).tolist()
         for quantity, value in {"loss": loss_now, "gradient": norm_now}.items():
             if not abs(value) < float("inf"):
-                raise NonFinite(quantity, step, _joined([each.batch for each in micro_batches]))
+                own = [each.batch for each in micro_batches if each.batch is not None]
+                raise NonFinite(quantity, step, _joined(own))
         return loss_now, error_now
 
-    def _update(self, micro_batches: Sequence[_MicroBatch], factor: float, adam_step: int) -> None:
+    def _update(self, micro_batches: Sequence[MicroBatch], factor: float, adam_step: int) -> None:
         """Update the table's levels, which share no rows, the networks, the per-image parameters and the occupancy
         grid, each on a core; on a GPU all levels at once. ``factor`` scales all learning rates."""
         levels = range(len(self.model.layout.resolutions))
         finest_first = [levels[level : level + 1] for level in reversed(levels)]  # no core waits long for the last
         together = [levels] if self.dataset.device.type == "cuda" else finest_first
         learning_rate = self.settings.learning_rate * factor
-        work = [partial(self._update_levels, some, micro_batches, learning_rate, adam_step) for some in together]
+        unscattered = micro_batches
+        if self.exchange is not None and self.exchange.is_dense:
+            self._scatter_and_add_up(self.exchange, together, micro_batches)
+            unscattered = ()
+        work = [partial(self._update_levels, some, unscattered, learning_rate, adam_step) for some in together]
         networks = [each.grad_networks._asdict() for each in micro_batches]
         work.append(partial(self._update_small, Weights._fields, networks, learning_rate, adam_step))
         background = [*(each.grad_background for each in micro_batches), self._background_prior(micro_batches)]
@@ -353,9 +381,9 @@ class HashGridTrainer:
         for _ in in_order(lambda update: update(), work, self.dataset.device):
             pass
 
-    def _background_prior(self, micro_batches: Sequence[_MicroBatch]) -> dict[str, Tensor]:
+    def _background_prior(self, micro_batches: Sequence[MicroBatch]) -> dict[str, Tensor]:
         """The prior's gradient of the background where rays of this batch reach it; elsewhere it stays as it is."""
-        rays = sum(len(each.batch.jitter) for each in micro_batches)
+        rays = len(micro_batches) * self._rays_per_micro_batch()
         touched = {
             name: torch.stack([each.grad_background[name] for each in micro_batches]).sum(0) != 0
             for name in self.background
@@ -363,18 +391,32 @@ class HashGridTrainer:
         return {name: BACKGROUND_PRIOR / rays * table * touched[name] for name, table in self.background.items()}
 
     def _update_levels(
-        self, levels: range, micro_batches: Sequence[_MicroBatch], learning_rate: float, adam_step: int
+        self, levels: range, micro_batches: Sequence[MicroBatch], learning_rate: float, adam_step: int
     ) -> None:
+        self._scatter(micro_batches, levels)
         layout, backend = self.model.layout, self.model.backend
-        gathered_rows = CORNERS * len(levels) * sum(len(each.points) for each in micro_batches)
-        with span("scatter", WorkCounts(gathered_rows=gathered_rows)):
-            for each in micro_batches:
-                backend.encode_backward_table(layout, levels, each.points, each.grad_features, self.grad_table)
         tables = self.model.table, self.grad_table, self.exp_avg["table"], self.exp_avg_sq["table"]
         rows = slice(layout.level_offsets[levels.start], layout.level_offsets[levels.stop])
         table, grad, exp_avg, exp_avg_sq = (tensor[rows] for tensor in tables)
         with span("optimiser", WorkCounts(streamed_bytes=ADAM_BYTES * table.numel())):
             backend.adam(table, grad, exp_avg, exp_avg_sq, learning_rate, adam_step)
+
+    def _scatter(self, micro_batches: Sequence[MicroBatch], levels: range) -> None:
+        gathered_rows = CORNERS * len(levels) * sum(len(each.points) for each in micro_batches)
+        with span("scatter", WorkCounts(gathered_rows=gathered_rows)):
+            for each in micro_batches:
+                self.model.backend.encode_backward_table(
+                    self.model.layout, levels, each.points, each.grad_features, self.grad_table
+                )
+
+    def _scatter_and_add_up(
+        self, exchange: Exchange, together: Sequence[range], micro_batches: Sequence[MicroBatch]
+    ) -> None:
+        """The table's gradient: of this process's own micro-batches, then of all."""
+        own = [each for each in micro_batches if each.batch is not None]
+        for _ in in_order(partial(self._scatter, own), together, self.dataset.device):
+            pass
+        exchange.add_up(self.grad_table)
 
     def _update_small(
         self, names: Iterable[str], gradients: Sequence[dict[str, Tensor]], learning_rate: float, adam_step: int
@@ -387,14 +429,14 @@ class HashGridTrainer:
                 self.model.backend.adam(parameter, gradient, exp_avg, exp_avg_sq, learning_rate, adam_step)
 
     def _update_effect(
-        self, effect: Effect, micro_batches: Sequence[_MicroBatch], learning_rate: float, adam_step: int
+        self, effect: Effect, micro_batches: Sequence[MicroBatch], learning_rate: float, adam_step: int
     ) -> None:
         self._update_small(
             parameters_of(effect), [each.grad_effects for each in micro_batches], learning_rate, adam_step
         )
         effect.fix_gauge()
 
-    def _raise_occupancy(self, micro_batches: Sequence[_MicroBatch]) -> None:
+    def _raise_occupancy(self, micro_batches: Sequence[MicroBatch]) -> None:
         with span("occupancy"):
             for each in micro_batches:
                 self.occupancy_grid.raise_to(each.points, each.optical_thickness)

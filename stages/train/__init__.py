@@ -10,7 +10,7 @@ VERSION = 29
 EXIT_CODE = 14
 RESUMES = True
 PUBLISHED = ("curve.json",)
-NOT_HASHED = ("checkpoint_seconds", "tensorboard")
+NOT_HASHED = ("checkpoint_seconds", "devices", "tensorboard")
 
 # Its own seconds count steps alone. Beside reading the photos, timing the first steps takes about STARTING_SECONDS,
 # validation and checkpoints 1.5 to 2 % (fox, fountain_p11 and sceaux_castle, three minutes each).
@@ -66,6 +66,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """
     from stages.train import training
 
-    loaded = training.load(config, inputs, folder, progress)
-    training.compute(loaded)
+    with training.ranks_of(config, inputs) as ranks:
+        loaded = training.load(config, inputs, folder, progress, ranks)
+        training.compute(loaded)
     return training.save(loaded, folder, progress)

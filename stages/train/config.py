@@ -112,6 +112,14 @@ class Config(StageConfig):
         gt=0,
         description="Seconds between checkpoints (default: a twentieth of the training time, at most 30).",
     )
+    devices: int = Field(
+        default=1,
+        ge=1,
+        description=(
+            "How many GPUs of this machine train together; without a GPU, how many processes on its CPU. torchrun "
+            "starts its own."
+        ),
+    )
     tensorboard: bool = Field(default=False, description="Also write the learning curve for TensorBoard.")
 
     @model_validator(mode="after")
@@ -142,6 +150,8 @@ class Config(StageConfig):
             flags.setdefault(field, f"--train.preset {self.preset}")
         if self.depth:
             flags.setdefault("grid", "--train.depth")
+        if self.devices > 1:
+            flags.setdefault("grid", "--train.devices")
         for field in FIELD_NAMES:
             options: Options = getattr(self, field)
             for name, option in type(options).model_fields.items():

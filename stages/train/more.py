@@ -13,8 +13,9 @@ from stages.train.config import Config
 from stages.train.state import TrainingBudget
 
 MORE_OPTIONS = ("after", "more_steps", "more_seconds")
+OWN_OPTIONS = ("checkpoint_seconds", "devices", "tensorboard")  # of each part of a training
 # Replaced by the additional budget, or without influence on the field.
-IGNORED_OPTIONS = (*MORE_OPTIONS, "steps", "seconds", "preset", "checkpoint_seconds", "tensorboard")
+IGNORED_OPTIONS = (*MORE_OPTIONS, "steps", "seconds", "preset", *OWN_OPTIONS)
 RESTART_HINT = "Train from the start with --train.seconds or --train.steps."
 
 
@@ -60,7 +61,7 @@ def continued(config: Config, inputs: Inputs) -> Config:
     free = {*IGNORED_OPTIONS, "target_psnr"} if before.target_psnr is not None else {*IGNORED_OPTIONS}
     if (why := next(_changes(config, before, free), None)) is not None:
         raise StageError("train.other-settings", "cannot continue training with other settings", why, RESTART_HINT)
-    own = {name: getattr(config, name) for name in (*MORE_OPTIONS, "checkpoint_seconds", "tensorboard")}
+    own = {name: getattr(config, name) for name in (*MORE_OPTIONS, *OWN_OPTIONS)}
     target = {"target_psnr": config.target_psnr or before.target_psnr}
     return Config.model_validate(manifest["config"] | own | target)
 

@@ -1,5 +1,11 @@
-"""One training as a stage: photos and settings are loaded, steps taken, the field saved with what came of them."""
+"""One training as a stage: photos and settings are loaded, steps taken, the field saved with what came of them.
 
+Where several processes (ranks) train together, rank 0 does all that, and :func:`follow` is what the others do.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -7,13 +13,18 @@ import torch
 
 from nerf.geometry.scene import Scene
 from nerf.runtime.matmul_precision import use_matmul_precision
+from nerf.runtime.ranks import RankLost, Ranks
+from nerf.training.data_parallel import LeadingTrainer, end_others, follow_first_rank
 from nerf.training.evaluation_pixels import sample_evaluation_pixels
+from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
-from stages.contract import Inputs, Progress, StageResult
+from nerf.training.trainer import FieldTrainer
+from stages.contract import Inputs, Progress, StageError, StageResult
 from stages.effects.decisions import read_decisions
 from stages.effects.image_effects import image_effects, learnt_effects
 from stages.hardware.device import compute_device, cores
 from stages.hardware.memory import check_memory
+from stages.hardware.ranks import check_ranks, leading, rank_count, tasks_of_first_rank
 from stages.io.amounts import short_count
 from stages.io.field_files import save_field
 from stages.io.files import read_scene
@@ -54,12 +65,68 @@ class Training(NamedTuple):
     earlier_seconds: float
 
 
-def load(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Training:
+@contextmanager
+def ranks_of(config: Config, inputs: Inputs) -> Iterator[Ranks | None]:
+    """The processes that train together, this one first; None where it trains alone. Raises StageError where one of
+    them is gone."""
+    if rank_count(config.devices) == 1:
+        yield None
+        return
+    if config.kind != "grid":
+        why = "data-parallel training is of the hash-grid field alone"
+        raise StageError(
+            "train.one-device", f"the {config.kind} field trains on one device", why, "Leave out torchrun."
+        )
+    assert config.grid.micro_batches, "plan() chooses it"
+    check_ranks(config.devices, config.grid.micro_batches)
+    folders = {name: str(path.resolve()) for name, path in inputs.items()}
+    with leading(config.devices, {"config": config.model_dump(mode="json"), "inputs": folders}) as ranks:
+        yield ranks
+        with suppress(RankLost):  # which matters no longer
+            end_others(ranks)
+
+
+class _Silent:
+    """The progress of a rank that is not the first."""
+
+    def update(self, message: str, done: float | None = None) -> None:
+        """Say nothing."""
+
+    def note(self, code: str, text: str) -> None:
+        """Say nothing."""
+
+
+def follow() -> None:
+    """Be one of the other ranks: train with rank 0 whenever it asks for it, until it ends."""
+    for task, ranks in tasks_of_first_rank():
+        config = Config.model_validate(task["config"])
+        trainers = _trainers_later(config, {name: Path(folder) for name, folder in task["inputs"].items()})
+        with use_matmul_precision(config.matmul):
+            follow_first_rank(ranks, lambda attempt, trainers=trainers: _hash_grid(trainers()(attempt)))
+
+
+def _trainers_later(config: Config, inputs: Inputs) -> Callable[[], Callable[[int], FieldTrainer]]:
+    """Reads the photos at the first call, which comes when rank 0 has its trainer and so has filled the pixel store."""
+    assert config.downscale is not None, "plan() chooses it"
+    scene, downscale = read_scene(inputs["normalise"]), config.downscale
+    if config.target_psnr is not None:
+        scene = with_validation_split(scene)
+    depth = inputs["depth"] if config.depth else None
+
+    @cache
+    def trainers() -> Callable[[int], FieldTrainer]:
+        dataset = guided_dataset(inputs, scene, downscale, _Silent(), depth).to(compute_device())
+        return _trainers(config, scene, inputs, dataset)
+
+    return trainers
+
+
+def load(config: Config, inputs: Inputs, folder: Path, progress: Progress, ranks: Ranks | None = None) -> Training:
     """Load the photos and put everything in place. Nothing is open in ``config``."""
     scene, earlier = read_scene(inputs["normalise"]), earlier_seconds(config, inputs)
     if config.target_psnr is not None:
         scene = _with_validation_photos(config.target_psnr, scene, progress)
-    run = prepare(config, scene, inputs, folder, progress)
+    run = prepare(config, scene, inputs, folder, progress, ranks)
     run.live = LiveFolder(folder, lambda shown: save_field(shown, run.trainer.model, _field_info(config, scene, run)))
     say_if_inexact(config, progress)
     return Training(config, scene, run, earlier)
@@ -76,7 +143,9 @@ def _with_validation_photos(target_psnr: float, scene: Scene, progress: Progress
     return scene
 
 
-def prepare(config: Config, scene: Scene, inputs: Inputs, folder: Path, progress: Progress) -> TrainingRun:
+def prepare(
+    config: Config, scene: Scene, inputs: Inputs, folder: Path, progress: Progress, ranks: Ranks | None = None
+) -> TrainingRun:
     """Photos, evaluation pixels, budget and trainer of a run. Raises StageError if the field takes too much memory."""
     assert config.downscale is not None, "plan() chooses it"
     device = compute_device()
@@ -101,11 +170,11 @@ def prepare(config: Config, scene: Scene, inputs: Inputs, folder: Path, progress
         evaluation_sets = evaluation_sets._replace(target=Target(config.target_psnr, validation))
     budget = budget_of(config, inputs)
     _note_sizes(config, budget, dataset, progress)
-    decisions, views = read_decisions(inputs["effects"]), scene.of_split("train")
+    make = _trainers(config, scene, inputs, dataset)
+    if ranks is not None:
+        progress.note("train.ranks", ranks_message(ranks, config))
     return TrainingRun(
-        lambda attempt: make_trainer(
-            config, scene, dataset, config.seed + attempt, image_effects(decisions, scene, views, dataset)
-        ),
+        make if ranks is None else lambda attempt: LeadingTrainer(_hash_grid(make(attempt)), attempt, ranks),
         evaluation_sets,
         budget,
         folder,
@@ -113,6 +182,24 @@ def prepare(config: Config, scene: Scene, inputs: Inputs, folder: Path, progress
         TrainingLog(folder, config.tensorboard),
         progress,
     )
+
+
+def _trainers(config: Config, scene: Scene, inputs: Inputs, dataset: RayDataset) -> Callable[[int], FieldTrainer]:
+    """Makes a fresh trainer for each attempt: every rank the same."""
+    decisions, views = read_decisions(inputs["effects"]), scene.of_split("train")
+    return lambda attempt: make_trainer(
+        config, scene, dataset, config.seed + attempt, image_effects(decisions, scene, views, dataset)
+    )
+
+
+def _hash_grid(trainer: FieldTrainer) -> HashGridTrainer:
+    assert isinstance(trainer, HashGridTrainer), "ranks_of() lets no other field pass"
+    return trainer
+
+
+def ranks_message(ranks: Ranks, config: Config) -> str:
+    """Who computes a step."""
+    return f"{ranks.size} processes share the {config.grid.micro_batches} micro-batches of a step, over {ranks.backend}"
 
 
 def _note_sizes(config: Config, budget: TrainingBudget, dataset: RayDataset, progress: Progress) -> None:
@@ -188,6 +275,22 @@ def _facts(training: Training) -> dict[str, object]:
         "rollbacks": state.rollbacks,
         "failure_reason": state.failure_reason,
         **precision_facts(config),
+        **_rank_facts(training.run),
+    }
+
+
+def _rank_facts(run: TrainingRun) -> dict[str, object]:
+    """What several ranks brought each other since the last resume; nothing where one process trained."""
+    trainer = run.trainer
+    if not isinstance(trainer, LeadingTrainer):
+        return {}
+    ranks, exchange = trainer.ranks, trainer.exchange
+    reduction = "dense" if exchange.is_dense else "sparse"
+    steps = max(1, exchange.steps)
+    return {
+        "ranks": {"size": ranks.size, "backend": ranks.backend, "table_gradient": reduction},
+        "received_bytes_per_step": round(ranks.received_bytes / steps),
+        "exchange_share": round(min(1.0, ranks.waited_seconds / steps / run.speed.seconds_per_step), 3),
     }
 
 

@@ -14,6 +14,7 @@ from stages.effects.decisions import Space
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.hardware.device import compute_device, cores
 from stages.hardware.memory import available_on
+from stages.hardware.ranks import rank_count
 from stages.io.amounts import bytes_in_words, short_count
 from stages.train.config import Config
 from stages.train.data import has_background_model, training_background
@@ -75,7 +76,8 @@ SAMPLE_BYTES = 4096  # that a sample of a step takes while it is computed
 
 def with_defaults(config: Config) -> Config:
     """``config`` with what this field is usually trained with where it leaves that open."""
-    gpu, micro_batches = compute_device() == "cuda", config.grid.micro_batches or min(MAX_MICRO_BATCHES, cores())
+    gpu, at_once = compute_device() == "cuda", max(cores(), rank_count(config.devices))
+    micro_batches = config.grid.micro_batches or min(MAX_MICRO_BATCHES, at_once)
     most = MAX_STEP_SAMPLES if gpu else min(MAX_STEP_SAMPLES, micro_batches * MICRO_BATCH_SAMPLES[_space(config)])
     samples = config.grid.target_samples or most
     rate = LARGE_STEP_LEARNING_RATE if samples >= MAX_STEP_SAMPLES else LEARNING_RATES[_space(config)]

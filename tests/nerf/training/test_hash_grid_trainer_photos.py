@@ -13,14 +13,14 @@ from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import Rendering
 from nerf.kernels import torch as reference
-from nerf.training.hash_grid_trainer import HashGridTrainer, _MicroBatch
+from nerf.training.hash_grid_trainer import HashGridTrainer, MicroBatch
 from nerf.training.losses import huber_loss
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite
 from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, same, small_dataset, trainer
 
 
-def part_without_effects(run: HashGridTrainer, step: int, progress: float, rays: int, chunk: int) -> _MicroBatch:
+def part_without_effects(run: HashGridTrainer, step: int, progress: float, rays: int, chunk: int) -> MicroBatch:
     """What a chunk adds to loss and gradients, written as if there were no effects."""
     batch = run._batch(step, progress, chunk, rays)
     done = run.model.forward(batch.rays, batch.jitter, batch.thinning_offset, batch.background)
@@ -32,7 +32,7 @@ def part_without_effects(run: HashGridTrainer, step: int, progress: float, rays:
     norm = torch.nn.utils.get_total_norm([*gradients.weights, gradients.features])
     losses = huber.sum() / (3 * rays), error.square().sum() / (3 * rays)
     learnt = gradients.weights, gradients.features, done.points, dict[str, Tensor](), dict[str, Tensor]()
-    return _MicroBatch(batch, *losses, *learnt, norm, done.optical_thickness, done.density_evaluations)
+    return MicroBatch(batch, *losses, *learnt, norm, done.optical_thickness, done.density_evaluations)
 
 
 def test_effects_that_are_off_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
