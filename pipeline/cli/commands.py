@@ -37,6 +37,7 @@ from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace
 from pipeline.view import check_installed, open_browser, serve_during
 from stages.contract import StageError
+from stages.hardware.ranks import launched
 from stages.io.amounts import duration
 
 REPORT_IT = "Finished stages are kept. Please report it with the output of the same command and --debug."
@@ -173,6 +174,8 @@ def command_batch(words: Sequence[str]) -> int:
     """``pipeline batch SCENES``: a run for each scene in a folder."""
     if words and words[0].startswith("-") and not {"-h", "--help"} & {*words}:
         raise UsageError(f"give the folder of scenes first: pipeline batch SCENES {' '.join(words[:2])} …")
+    if launched().size > 1:
+        raise UsageError("batch starts a process for each scene, which torchrun knows nothing of; give --train.devices")
     given = arguments.parse(arguments.BatchArguments, "batch", words)
     settings = given.settings
     if given.config is not None:

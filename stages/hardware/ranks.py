@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from nerf.runtime.ranks import Ranks
 
-OF_LAUNCHER = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")  # torchrun gives them to each process
+OF_LAUNCHER = ("TORCHELASTIC_RUN_ID", "RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")  # of each of its processes
 FOLLOW = ["-P", "-c", "from stages.train.training import follow; follow()"]
 POLL_SECONDS, STARTING_SECONDS, ENDING_SECONDS = 0.05, 300.0, 5.0
 NO_TASK = "null"
@@ -207,7 +207,7 @@ def _child(rank: int, size: int, port: int) -> Child:
         stdin=subprocess.DEVNULL,
         stdout=complaints,
         stderr=complaints,
-        env=child_environment() | own | {"TORCHELASTIC_USE_AGENT_STORE": "True"},
+        env=child_environment() | own | {"TORCHELASTIC_RUN_ID": "own", "TORCHELASTIC_USE_AGENT_STORE": "True"},
         start_new_session=True,
     )
     return child, complaints

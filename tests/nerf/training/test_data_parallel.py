@@ -4,11 +4,12 @@ NCCL where two GPUs are."""
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, multiprocessing
-from torch.distributed import TCPStore
+from torch.distributed import TCPStore  # pyright: ignore[reportPrivateImportUsage]
 
 from nerf.effects import ImageEffects, Images
 from nerf.effects.exposure import ExposureModel
@@ -30,7 +31,7 @@ PLAIN, UNEVEN, EFFECTS, DENSE, BROKEN = range(5)
 STEPS = 20  # the occupancy grid is updated once
 
 
-def case(number: int, device: torch.device, backend=reference) -> HashGridTrainer:
+def case(number: int, device: torch.device, backend: Any = reference) -> HashGridTrainer:
     """The trainer of a case, the same in every process."""
     field = {DENSE: FIELD, EFFECTS: UNBOUNDED}.get(number, LARGE_TABLE)
     settings = SHARED

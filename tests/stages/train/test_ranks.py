@@ -106,7 +106,7 @@ def test_devices_that_cannot_share_a_step_are_refused(inputs: dict[str, Path], m
         pass
     with pytest.raises(ValueError, match=r"train\.devices has no effect"):
         Config(field="vanilla", devices=2)
-    for name, value in {"RANK": "0", "WORLD_SIZE": "4", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "1"}.items():
+    for name, value in dict(zip(ranks.OF_LAUNCHER, ("1", "0", "4", "127.0.0.1", "1"), strict=True)).items():
         monkeypatch.setenv(name, value)
     with refused("train.one-device"), ranks_of(tiny("vanilla"), inputs):
         pass
