@@ -111,7 +111,7 @@ def leading(devices: int, task: dict[str, Any]) -> "Iterator[Ranks]":
         store = _numbered(kept, 0)
         children = {rank: _child(rank, size, kept.port) for rank in range(1, size)}
     try:
-        store.set("task", json.dumps(task))
+        store.set("task", json.dumps(task | {"device": compute_device()}))
         _await_others(store, size, children)
         yield _joined(PrefixStore("group", store), Place(0, size))
     except RankLost as error:
@@ -143,6 +143,8 @@ def tasks_of_first_rank() -> "Iterator[tuple[dict[str, Any], Ranks]]":
             time.sleep(POLL_SECONDS)
         if (task := json.loads(numbered.get("task"))) is None:
             return
+        if (own := compute_device()) != task["device"]:  # they could not understand each other
+            sys.exit(f"rank {launched().rank} computes on {own}, rank 0 on {task['device']}")
         numbered.set(f"ready {launched().rank}", "")
         try:
             yield task, _joined(PrefixStore("group", numbered), launched())

@@ -100,6 +100,12 @@ def test_one_process_has_no_ranks(inputs: dict[str, Path], monkeypatch: pytest.M
         assert none is None
 
 
+def test_a_process_on_another_device_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ranks, "compute_device", lambda: "another")
+    with refused("hardware.rank-lost", "rank 1 computes on", "rank 0 on another"), ranks.leading(2, {}):
+        pass
+
+
 def test_devices_that_cannot_share_a_step_are_refused(inputs: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     few, both = (tiny("grid", devices=count, grid={"micro_batches": 2}) for count in (3, 2))
     with refused("hardware.too-many-devices", 3, 2), ranks_of(few, inputs):
