@@ -15,6 +15,7 @@ The one that moves fewer bytes is taken at each step. On a GPU it is always the 
 so ranks that scattered for themselves would drift apart.
 """
 
+import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -151,13 +152,14 @@ class LeadingTrainer:
     """The trainer of rank 0 (:class:`nerf.training.trainer.FieldTrainer`): the other ranks take each step with it.
 
     ``attempt`` is what they make their trainers with. They are sent the state before the first step, and after it was
-    loaded anew.
+    loaded anew. ``seconds`` are those of all steps but these, for which the others also read the photos;
+    ``waited_seconds`` are those of them in which this rank sent, received or waited.
     """
 
     def __init__(self, trainer: HashGridTrainer, attempt: int, ranks: Ranks) -> None:
         self.trainer, self.attempt, self.ranks = trainer, attempt, ranks
         self.exchange = trainer.exchange = RankExchange(ranks, trainer.model)
-        self.others_know = False
+        self.others_know, self.seconds, self.waited_seconds = False, 0.0, 0.0
 
     @property
     def model(self) -> HashGridField:
@@ -175,6 +177,14 @@ class LeadingTrainer:
             self.ranks.command([STATE, float(self.attempt), 0.0, 0.0], COMMAND_LENGTH)
             self.ranks.copy_from_first(self.trainer.state())
             self.others_know = True
+            return self._with_others(step, progress, lr_scale)
+        started, waited = time.perf_counter(), self.ranks.waited_seconds
+        result = self._with_others(step, progress, lr_scale)
+        self.seconds += time.perf_counter() - started
+        self.waited_seconds += self.ranks.waited_seconds - waited
+        return result
+
+    def _with_others(self, step: int, progress: float, lr_scale: float) -> StepResult:
         self.ranks.command([STEP, float(step), progress, lr_scale], COMMAND_LENGTH)
         return _take_step(self.trainer, self.ranks, step, progress, lr_scale)
 

@@ -286,11 +286,10 @@ def _rank_facts(run: TrainingRun) -> dict[str, object]:
         return {}
     ranks, exchange = trainer.ranks, trainer.exchange
     reduction = "dense" if exchange.is_dense else "sparse"
-    steps = max(1, exchange.steps)
     return {
         "ranks": {"size": ranks.size, "backend": ranks.backend, "table_gradient": reduction},
-        "received_bytes_per_step": round(ranks.received_bytes / steps),
-        "exchange_share": round(min(1.0, ranks.waited_seconds / steps / run.speed.seconds_per_step), 3),
+        "received_bytes_per_step": round(ranks.received_bytes / max(1, exchange.steps)),
+        "exchange_share": round(trainer.waited_seconds / trainer.seconds, 3) if trainer.seconds else None,
     }
 
 
