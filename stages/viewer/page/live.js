@@ -2,6 +2,7 @@
 
 const POLL_MS = 1000;
 const SLOW_POLL_MS = 3000; // where nothing changes: less than OPEN_SECONDS of the server
+const PATIENCE_MS = 15_000; // fields may come faster than a picture fills in: it is finished first, unless that takes longer
 const STRIP_FRACTION = 0.1; // of the time in which pixels fill in: without a graphics chip the training and the page share the cores
 const SVG = "http://www.w3.org/2000/svg";
 
@@ -51,12 +52,14 @@ class Follower {
   /** Draws the field of that name, if it is another than the one that is drawn. */
   async follow(name) {
     if (!name || name === this.shown || this.cannot) return;
+    const filling = window.viewer && !window.viewer.renderer.isDone;
+    if (filling && this.state.phase === "training" && performance.now() - this.shownSince < PATIENCE_MS) return;
     const field = await this.answer(`field/${name}`, "arrayBuffer");
     if (!field) return; // the training has gone on: the next answer names a newer one
     const scene = window.viewer ? null : await this.answer("scene", "arrayBuffer");
     if (!scene && !window.viewer) return;
     try {
-      if (await this.draw(contentsOf(field), scene && contentsOf(scene))) this.shown = name;
+      if (await this.draw(contentsOf(field), scene && contentsOf(scene))) [this.shown, this.shownSince] = [name, performance.now()];
     } catch (error) {
       this.cannot = true;
       sayWhyNot(error);

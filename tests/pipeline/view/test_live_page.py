@@ -4,9 +4,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from tests.pipeline.view.running_training import RunningTraining
+from pipeline.engine.run_file import RunFile, write
+from tests.pipeline.view.running_training import KEYS, RunningTraining
 from tests.pipeline.view.test_server import Served
 from tests.stages.viewer.browser import Viewer, chromium
 
@@ -15,6 +17,45 @@ from tests.stages.viewer.browser import Viewer, chromium
 def browser() -> Iterator[Any]:
     with chromium() as running:
         yield running
+
+
+def test_it_follows_a_training_to_the_end_it_asks_for(browser: Any, tmp_path: Path) -> None:
+    with RunningTraining(tmp_path) as training:
+        server = Served(training.root)
+        page = Viewer(browser, server.server.url)
+        page.until("follower.shown")
+        first, field = page.drawn(), page.run("follower.shown")
+        assert page.run("document.querySelectorAll('b').length") == 0, "a name is text and no HTML"
+        page.until(f"follower.shown !== '{field}' && document.querySelector('#live-curve polyline')")
+        assert np.abs(page.drawn() - first).max() > 10
+        page.run("document.getElementById('finish').click()")
+        training.wait()
+        page.until("follower.shown === 'finished'")
+        assert page.run("document.getElementById('live-phase').textContent").startswith("Finished")
+        assert page.run("document.getElementById('finish').hidden")
+        assert np.ptp(page.shown()) > 100
+        assert page.faults == []
+        page.run("window.before = true")
+        write(training.root, RunFile(keys=KEYS | {"train": "e" * 64}))
+        # Another training was begun. The page loads anew meanwhile, which Viewer.until would not outlive.
+        page.page.get_by_text("The training has not begun.").wait_for(state="attached")
+        assert page.run("!window.before")
+        server.close()
+        page.close()
+
+
+def test_what_cannot_be_drawn_is_no_end_of_the_server(browser: Any, tmp_path: Path) -> None:
+    with RunningTraining(tmp_path) as training:
+        server = Served(training.root)
+        page = Viewer(browser, server.server.url)
+        page.until("follower.shown")
+        page.run("() => { viewer.replace = () => { throw new TypeError('broken'); }; }")
+        page.until("document.getElementById('message').textContent.includes('broken')")
+        step = page.run("follower.state.step")
+        page.until(f"follower.state.step > {step}")
+        assert page.run("document.getElementById('live-phase').textContent").startswith("Training")
+        page.close()
+        server.close()
 
 
 def test_it_says_when_its_server_is_gone(browser: Any, tmp_path: Path) -> None:

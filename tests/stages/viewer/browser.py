@@ -80,6 +80,10 @@ class Viewer:
     def shown(self) -> np.ndarray:
         """What the canvas shows, all of its pixels drawn."""
         self.done()
+        return self.drawn()
+
+    def drawn(self) -> np.ndarray:
+        """What the canvas is to show, drawn apart from it: while fields follow each other it may never be done."""
         draw = "async () => Array.from(await viewer.renderer.picture(viewer.canvas.width, viewer.canvas.height))"
         return np.array(self.run(draw), float)
 
