@@ -11,6 +11,7 @@ from stages.sfm import global_mapping
 from stages.sfm.colmap.database import adopt_cameras
 from stages.sfm.colmap.diagnosis import compare_models, disagree
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
+from stages.sfm.colmap.joining import join_pieces
 from stages.sfm.colmap.mapping import incremental_options, map_globally, map_incrementally
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import (
@@ -22,9 +23,9 @@ from stages.sfm.colmap.repair import (
     deregister,
     drop_outside_main_segment,
     fragments_sequence,
-    longest_supported,
     reasons,
     register_again,
+    supported_runs,
     supported_steps,
 )
 from stages.sfm.colmap.thinning import thin_matches
@@ -70,7 +71,7 @@ def run_mapping(
         if found and hold_focal:
             release_focal_lengths(found[0])
         if found and trusted:
-            found = _most_steps(found, matches, mapping, state, trusted)
+            found = _most_steps(found, matches, mapping, hold_focal, state, trusted)
     checked = CheckedModel(None, {}, False, False)
     failure = global_mapping.failure(beside) if beside else None
     other = load_native(beside.folder) if beside and not failure else None
@@ -99,24 +100,49 @@ def _map_incrementally(matches: Path, options: Any, state: JobState) -> list[Any
 
 
 def _most_steps(
-    found: list[Any], matches: Path, mapping: MappingOptions, state: JobState, trusted: Collection[tuple[int, int]]
+    found: list[Any],
+    matches: Path,
+    mapping: MappingOptions,
+    hold_focal: bool,
+    state: JobState,
+    trusted: Collection[tuple[int, int]],
 ) -> list[Any]:
-    """The sub-models by how many photos hang together in them by ``trusted`` pairs; mapped once more with the cameras
-    of the first one held, if that makes it longer: where a photo sees one plane, a pair alone tells neither its pose
-    nor its camera (docs/experiments/match_graph.md)."""
+    """The sub-models by how many photos hang together in them by ``trusted`` pairs, the longest pieces joined.
 
-    def ranked(models: list[Any]) -> tuple[list[Any], int]:
-        lengths = [longest_supported(model, state.database, trusted) for model in models]
-        order = sorted(range(len(models)), key=lambda number: lengths[number], reverse=True)
-        return [models[number] for number in order], max(lengths, default=0)
+    They are mapped once more with the cameras of the longest piece held: where a photo sees one plane, a pair alone
+    tells neither its pose nor its camera (docs/experiments/match_graph.md). Cameras that this piece does not have, of
+    photos that do not share theirs, are as free as before: it says nothing about them.
+    """
+    known = state.job.camera_params is not None
 
-    found, length = ranked(found)
-    if state.job.camera_params is not None or length < MIN_PHOTOS_OF_CAMERA:
+    def by_length(models: list[Any]) -> list[tuple[Any, list[list[int]]]]:
+        runs = [(model, supported_runs(model, state.database, trusted)) for model in models]
+        return sorted(runs, key=lambda one: len(one[1][0]), reverse=True)
+
+    ranked = by_length(found)
+    model, (longest, *_) = ranked[0]
+    if not known and len(longest) >= MIN_PHOTOS_OF_CAMERA:
+        held = adopt_cameras(matches, model, longest)
+        options = incremental_options(state.job.seed, mapping, known, state.thinned, hold_focal, held)
+        again = by_length(_map_incrementally(matches, options, state))
+        ranked = max(ranked, again, key=lambda models: len(models[0][1][0]) if models else 0)
+    return _with_pieces_joined(ranked, state, trusted)
+
+
+def _with_pieces_joined(
+    ranked: Sequence[tuple[Any, Sequence[Sequence[int]]]], state: JobState, trusted: Collection[tuple[int, int]]
+) -> list[Any]:
+    """The models, each given with the runs of its photos that hang together, the one with the longest run first; before
+    them a model of joined pieces if its steps hold more photos together. It takes the place of models that have no
+    other photos."""
+    found, length = [model for model, _ in ranked], len(ranked[0][1][0])
+    joined = join_pieces(
+        [(model, run) for model, runs in ranked for run in runs], camera_is_known=state.job.camera_params is not None
+    )
+    if joined is None or len(supported_runs(joined, state.database, trusted)[0]) <= length:
         return found
-    adopt_cameras(matches, found[0])
-    options = incremental_options(state.job.seed, mapping, camera_is_known=True, thinned=state.thinned)
-    again, longer = ranked(_map_incrementally(matches, options, state))
-    return again if longer > length else found
+    have = {*joined.reg_image_ids()}
+    return [joined, *(model for model in found if not have.issuperset(model.reg_image_ids()))]
 
 
 def _comparison(model: Any, other: Any, checks: Sequence[Candidate], database: Path, state: JobState) -> dict[str, Any]:

@@ -242,7 +242,12 @@ def _tolerance_px(
     """The median error of matches, and up to which one a pair agrees."""
     known = np.isfinite(error_px)
     median = float(np.median(np.repeat(error_px[known], weight[known].astype(int)))) if known.any() else 0.0
-    return median, float(np.clip(TOLERANCE_FACTOR * median, MIN_TOLERANCE_PX, most_px))
+    return median, tolerance_px(median, most_px)
+
+
+def tolerance_px(median_px: float, most_px: float = MAX_TOLERANCE_PX) -> float:
+    """Up to which median error something agrees with poses under which the errors have this median."""
+    return float(np.clip(TOLERANCE_FACTOR * median_px, MIN_TOLERANCE_PX, most_px))
 
 
 def consistent_matches(

@@ -291,13 +291,15 @@ def copy_without_matches_of(names: Container[str], database: Path, copy: Path) -
     finish_copy(unfinished, copy)
 
 
-def adopt_cameras(database: Path, model: pycolmap.Reconstruction) -> None:
-    """Give the cameras of the model's images the intrinsics that they have there, as known."""
+def adopt_cameras(database: Path, model: pycolmap.Reconstruction, image_ids: Iterable[int]) -> set[int]:
+    """Give the cameras of these images the intrinsics that they have in the model, as known; the ids of the cameras."""
+    camera_ids = {model.image(image_id).camera_id for image_id in image_ids}
     with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
-        for camera_id in {model.image(image_id).camera_id for image_id in model.reg_image_ids()}:
+        for camera_id in sorted(camera_ids):
             camera = pycolmap.Camera(model.camera(camera_id).todict())
             camera.has_prior_focal_length = True
             db.update_camera(camera)
+    return camera_ids
 
 
 def copy_without_pairs(database: Path, copy: Path, pairs: Iterable[Sequence[int]]) -> None:

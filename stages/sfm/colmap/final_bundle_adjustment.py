@@ -1,5 +1,6 @@
 """The final adjustment of cameras and points. Call it in a child process."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -159,9 +160,10 @@ def _adjust_thinned(
     model.update_point_3d_errors()
 
 
-def release_focal_lengths(model: pycolmap.Reconstruction) -> None:
-    """Adjust a model whose focal lengths were held while it was mapped, now with all of its images to tell them."""
-    bundle_adjust(model, set(), adjustment_options(False, noise_px(model, observations(model))))
+def release_focal_lengths(model: pycolmap.Reconstruction, constant_cameras: Collection[int] = ()) -> None:
+    """Adjust a model whose focal lengths were held while it was mapped, now with all of its images to tell them; those
+    of ``constant_cameras`` stay. Observations that do not fit are dropped."""
+    bundle_adjust(model, set(constant_cameras), adjustment_options(False, noise_px(model, observations(model))))
     limits = pycolmap.IncrementalMapperOptions()
     pycolmap.ObservationManager(model).filter_all_points3D(limits.filter_max_reproj_error, limits.filter_min_tri_angle)
     model.update_point_3d_errors()

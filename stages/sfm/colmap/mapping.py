@@ -1,6 +1,6 @@
 """From matches to sub-models: incremental and global mapping. Call it in a worker process."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import numpy as np
@@ -40,16 +40,23 @@ def map_incrementally(
 
 
 def incremental_options(
-    seed: int, mapping: MappingOptions, camera_is_known: bool, thinned: bool, hold_focal: bool = False
+    seed: int,
+    mapping: MappingOptions,
+    camera_is_known: bool,
+    thinned: bool,
+    hold_focal: bool = False,
+    held_cameras: Collection[int] = (),
 ) -> pycolmap.IncrementalPipelineOptions:
     """What mapping asks of images; a known camera is kept as it is. With ``thinned`` matches, those of many images,
     global bundle adjustment runs less often: long tracks hold the images together in the meantime.
 
     With ``hold_focal``, focal lengths that all pairs together tell are held: the first few images alone do not tell
     them from distortion and depth; where adjustment runs away with them, every image after these is placed wrongly.
-    :func:`~stages.sfm.colmap.final_bundle_adjustment.release_focal_lengths` is for afterwards.
+    :func:`~stages.sfm.colmap.final_bundle_adjustment.release_focal_lengths` is for afterwards. ``held_cameras`` (ids)
+    are kept as they are in the database, whatever becomes of the others.
     """
     options = pipeline_options(seed + mapping.seed_offset)
+    options.constant_cameras = options.mapper.constant_cameras = set(held_cameras)
     if thinned:
         options.ba_global_frames_ratio = options.ba_global_points_ratio = BA_GLOBAL_RATIO
         options.ba_global_max_refinements = BA_GLOBAL_MAX_REFINEMENTS

@@ -155,13 +155,17 @@ def supported_steps(
     return {(i, j) for (i, j), agrees in zip(pairs, supported, strict=True) if agrees}
 
 
-def longest_supported(model: pycolmap.Reconstruction, database: Path, trusted: Container[tuple[int, int]]) -> int:
-    """How many images hang together by :func:`supported_steps`, at most."""
-    ids = sorted(model.reg_image_ids())
+def supported_runs(
+    model: pycolmap.Reconstruction, database: Path, trusted: Container[tuple[int, int]]
+) -> list[list[int]]:
+    """The images (ids, sorted) of a model by which of them hang together by :func:`supported_steps`, most images
+    first."""
+    ids = np.array(sorted(model.reg_image_ids()), int)
     steps = np.searchsorted(ids, np.array([*supported_steps(model, database, trusted)], int).reshape(-1, 2))
     linked = np.zeros((len(ids), len(ids)), bool)
     linked[steps[:, 0], steps[:, 1]] = True
-    return int(np.bincount(connected(linked)).max(initial=0))
+    group = connected(linked)
+    return sorted((ids[group == number].tolist() for number in np.unique(group)), key=len, reverse=True)
 
 
 def drop_outside_main_segment(

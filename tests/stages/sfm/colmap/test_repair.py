@@ -1,6 +1,7 @@
 """COLMAP's synthetic matches and models, with known poses: check, repair, thinned matches, global mapping."""
 
 import sqlite3
+from collections.abc import Container, Iterable
 from contextlib import closing
 from itertools import combinations
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 
 from stages.io.photos import Photo
 from stages.sfm import global_mapping
-from stages.sfm.colmap.database import adopt_cameras
+from stages.sfm.colmap.database import adopt_cameras, copy_without_pairs
 from stages.sfm.colmap.diagnosis import compare_models
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.mapping import incremental_options, map_incrementally
@@ -25,12 +26,13 @@ from stages.sfm.colmap.repair import (
     deregister,
     drop_outside_main_segment,
     facts,
-    longest_supported,
     reasons,
     register_again,
+    supported_runs,
     supported_steps,
 )
 from stages.sfm.colmap.thinning import thin_matches
+from stages.sfm.mapping import _most_steps, _with_pieces_joined
 from stages.sfm.matching import consecutive_pairs
 from stages.sfm.retry_strategies import MappingOptions
 
@@ -48,10 +50,10 @@ def made(tmp_path: Path) -> Made:
     return make(tmp_path)
 
 
-def make(folder: Path, points: int = 400) -> Made:
+def make(folder: Path, points: int = 400, cameras: int = 1) -> Made:
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(
-        num_rigs=1, num_frames_per_rig=PHOTOS, num_points3D=points, num_points2D_without_point3D=20
+        num_rigs=cameras, num_frames_per_rig=PHOTOS // cameras, num_points3D=points, num_points2D_without_point3D=20
     )
     database = folder / "made.db"
     with pycolmap.Database.open(database) as db:
@@ -114,16 +116,7 @@ def test_a_turned_photo_is_named_and_registered_again(made: Made, tmp_path: Path
 
 def test_a_wholly_mismatched_photo_is_excluded_with_a_reason(made: Made) -> None:
     """Ten in a hundred photos with injected matches: here photo 5 has keypoints of others' points."""
-    random = np.random.default_rng(0)
-    with pycolmap.Database.open(made.database) as db, pycolmap.DatabaseTransaction(db):
-        for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
-            pair = pycolmap.pair_id_to_image_pair(pair_id)
-            if 5 in pair:
-                matches = np.array(geometry.inlier_matches)
-                matches[:, 1] = random.permutation(matches[:, 1])
-                geometry.inlier_matches = matches
-                db.delete_two_view_geometry(*pair)
-                db.write_two_view_geometry(*pair, geometry)
+    mismatch(made.database, {pair for pair in combinations(range(1, PHOTOS + 1), 2) if 5 in pair})
     checked = check_model(made.model, made.database, 0)
     assert checked.failed() == [5]
     (reason,) = reasons(made.model, checked).values()
@@ -131,6 +124,19 @@ def test_a_wholly_mismatched_photo_is_excluded_with_a_reason(made: Made) -> None
     deregister(made.model, checked.failed())
     assert made.model.num_reg_images() == PHOTOS - 1
     assert check_model(made.model, made.database, 0).check.passed.all()
+
+
+def mismatch(database: Path, pairs: Container[tuple[int, int]]) -> None:
+    """Let the matches of these pairs join keypoints of different points."""
+    random = np.random.default_rng(0)
+    with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
+        for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
+            if (pair := pycolmap.pair_id_to_image_pair(pair_id)) in pairs:
+                matches = np.array(geometry.inlier_matches)
+                matches[:, 1] = random.permutation(matches[:, 1])
+                geometry.inlier_matches = matches
+                db.delete_two_view_geometry(*pair)
+                db.write_two_view_geometry(*pair, geometry)
 
 
 def test_mapping_of_thinned_matches_finds_the_same_cameras(tmp_path: Path) -> None:
@@ -242,12 +248,59 @@ def test_steps_are_judged_by_all_their_matches(made: Made, tmp_path: Path) -> No
     copy_consistent_matches(wrong, made.database, copy, steps)
     supported = supported_steps(wrong, made.database, steps)
     assert steps - supported == {(3, 4), (4, 5), (5, 6), (6, 7)}, "depths are in doubt a step farther"
-    assert longest_supported(wrong, made.database, steps) == PHOTOS - 6
-    assert longest_supported(made.model, made.database, steps) == PHOTOS
+    assert supported_runs(wrong, made.database, steps) == [[*range(7, 17)], [1, 2, 3], [4], [5], [6]]
+    assert supported_runs(made.model, made.database, steps) == [[*range(1, PHOTOS + 1)]]
     checked = check_model(wrong, copy, 0)
     outside = drop_outside_main_segment(wrong, checked, [*range(1, PHOTOS + 1)], supported)
     failed = {wrong.image(image_id).name for image_id in checked.failed()}
     assert outside.keys() | failed == {wrong.image(image_id).name for image_id in range(1, 7)}
+
+
+def test_joined_pieces_replace_models_that_have_nothing_else(made: Made) -> None:
+    steps = {(i, i + 1) for i in range(1, PHOTOS)}
+    state: Any = SimpleNamespace(database=made.database, job=SimpleNamespace(camera_params=None))
+    models = [only(made.model, range(1, 10)), only(made.model, range(6, 15)), only(made.model, [1, 2, *range(12, 17)])]
+    models[1].transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(np.array([0.3, 1, 2])), np.array([1.0, 2, 3])))
+    runs = [[*range(1, 10)]], [[*range(6, 15)]], [[*range(13, 17)], [1, 2], [12]]
+    joined, *others = _with_pieces_joined([*zip(models, runs, strict=True)], state, steps)
+    assert sorted(joined.reg_image_ids()) == [*range(1, 15)] and others == models[2:]
+    assert supported_runs(joined, made.database, steps) == [[*range(1, 15)]]
+    assert compare_models(made.model, joined)["agree"] == 14
+    turn(models[1], 8, degrees=3.0)  # both have it
+    assert _with_pieces_joined([*zip(models, runs, strict=True)], state, steps) == models
+
+
+def test_joined_pieces_have_to_hold_together(made: Made) -> None:
+    """Pieces that agree are joined in vain where the matches of a step contradict it all the same."""
+    steps = {(i, i + 1) for i in range(1, PHOTOS)}
+    state: Any = SimpleNamespace(database=made.database, job=SimpleNamespace(camera_params=None))
+    models, runs = [only(made.model, range(6, 17)), only(made.model, range(1, 11))], [[*range(6, 17)], [*range(1, 11)]]
+    ranked = [(model, [run]) for model, run in zip(models, runs, strict=True)]
+    (joined,) = _with_pieces_joined(ranked, state, steps)
+    assert joined.num_reg_images() == PHOTOS
+    mismatch(made.database, {(8, 9)})
+    assert _with_pieces_joined(ranked, state, steps) == models
+
+
+def test_mapping_again_holds_the_cameras_of_the_longest_piece(made: Made, tmp_path: Path) -> None:
+    steps, matches = {(i, i + 1) for i in range(1, PHOTOS)}, tmp_path / "matches.db"
+    copy_without_pairs(made.database, matches, [])
+    set_focal_length(matches, 0.9 * FOCAL_PX, by_exif=False)
+    job = SimpleNamespace(camera_params=None, seed=0, folder=str(tmp_path))
+    state: Any = SimpleNamespace(database=made.database, images=tmp_path, thinned=True, send=lambda **_: None, job=job)
+    piece = only(made.model, range(1, 12))
+    (model,) = _most_steps([piece], matches, MappingOptions(), False, state, steps)
+    assert supported_runs(model, made.database, steps) == [[*range(1, PHOTOS + 1)]]
+    assert model.camera(1).mean_focal_length() == FOCAL_PX == focal_length(matches)
+    short = only(made.model, range(1, 9))
+    assert _most_steps([short], matches, MappingOptions(), False, state, steps) == [short], "too few tell no camera"
+
+
+def only(model: Any, images: Iterable[int]) -> Any:
+    """The model with some of its images alone."""
+    part = pycolmap.Reconstruction(model)
+    deregister(part, sorted({*model.reg_image_ids()}.difference(images)))
+    return part
 
 
 def turned_alone(made: Made, image_id: int) -> Any:
@@ -309,7 +362,23 @@ def test_models_that_disagree_name_images_with_different_poses(made: Made) -> No
 def test_adopted_cameras_are_those_of_the_model(made: Made) -> None:
     model = pycolmap.Reconstruction(made.model)
     model.camera(1).focal_length = 1.5 * FOCAL_PX
-    adopt_cameras(made.database, model)
+    assert adopt_cameras(made.database, model, [3, 4]) == {1}
     with pycolmap.Database.open(made.database) as db:
         (camera,) = db.read_all_cameras()
     assert camera.mean_focal_length() == 1.5 * FOCAL_PX and camera.has_prior_focal_length
+
+
+def test_only_adopted_cameras_are_held(tmp_path: Path) -> None:
+    made = make(tmp_path, cameras=PHOTOS)
+    with pycolmap.Database.open(made.database) as db, pycolmap.DatabaseTransaction(db):
+        for camera in db.read_all_cameras():
+            camera.focal_length = 1.1 * FOCAL_PX
+            db.update_camera(camera)
+    held = adopt_cameras(made.database, made.model, range(1, 12))
+    assert len(held) == 11
+    options = incremental_options(0, MappingOptions(), camera_is_known=False, thinned=True, held_cameras=held)
+    (model,) = map_incrementally(made.database, tmp_path, tmp_path / "models", options)
+    assert model.num_reg_images() == PHOTOS
+    focal = {i: model.camera(i).mean_focal_length() for i in model.cameras}
+    assert {focal[i] for i in held} == {FOCAL_PX}
+    assert all(0 < abs(focal[i] / FOCAL_PX - 1) < 0.02 for i in focal.keys() - held), "found, though wrong at first"
