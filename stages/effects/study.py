@@ -162,7 +162,7 @@ class _Study:
         if not self.config.pilot_steps:
             return "--effects.pilot-steps 0"
         if self.pilots == self.config.pilots:
-            return f"{self.pilots} were made already" if self.pilots else "there is no time for one"
+            return f"{self.pilots} already made" if self.pilots else "there is no time for one"
         if fits_poses(off, on) and self.fitting_pilots == self.config.fitting_pilots:
             return "there is no time for one that fits poses"
         if self.trial is None:

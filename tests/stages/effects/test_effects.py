@@ -128,7 +128,7 @@ def test_there_are_two_pilots_at_most(decided: Callable) -> None:
     grey = {name: found(None) for name in ("exposure", "view_dependence", "pose_refinement")}
     decisions, table, _, tried = decided(effects.Config(), 1.0, **grey)
     assert tried == ["exposure", "pose_refinement"] and "view_dependence" in decisions.on
-    assert table["view_dependence"]["reason"] == "one of two; unclear, and no pilot: 2 were made already"
+    assert table["view_dependence"]["reason"] == "one of two; unclear, and no pilot: 2 already made"
 
 
 def test_a_diverging_pilot_leaves_the_effect(decided: Callable) -> None:
