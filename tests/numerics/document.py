@@ -53,6 +53,8 @@ ELSEWHERE = {
     "nerf/training/vanilla_trainer.py": "sums of micro-batches; refuses non-finite values before the update: "
     "tests/nerf/training/test_vanilla_trainer.py",
     "nerf/training/hash_grid_trainer.py": "likewise: tests/nerf/training/test_hash_grid_trainer.py",
+    "nerf/training/data_parallel.py": "sums over processes, bit for bit or to 1e-6 those of one: "
+    "tests/nerf/training/test_data_parallel.py",
     "nerf/runtime/matmul_precision.py": "lets matrix products be off by 1e-4 if that is faster: "
     "tests/nerf/runtime/test_matmul_precision.py",
     "nerf/training/schedule.py": "learning rates within the range they are given, in float64: "
@@ -77,7 +79,7 @@ ELSEWHERE = {
 }
 NO_FORMULA = {
     "nerf/geometry/scene.py", "nerf/fields/interface.py", "nerf/runtime/parallel.py", "nerf/runtime/randomness.py",
-    "nerf/runtime/profiler.py", "nerf/runtime/machine_rates.py", "nerf/training/pixel_sampler.py",
+    "nerf/runtime/ranks.py", "nerf/runtime/profiler.py", "nerf/runtime/machine_rates.py", "nerf/training/pixel_sampler.py",
 }  # fmt: skip
 # Measured as the rows of the functions they repeat.
 REPEATED = ("nerf/kernels/warp/",)
