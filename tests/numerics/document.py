@@ -79,7 +79,8 @@ ELSEWHERE = {
 }
 NO_FORMULA = {
     "nerf/geometry/scene.py", "nerf/fields/interface.py", "nerf/runtime/parallel.py", "nerf/runtime/randomness.py",
-    "nerf/runtime/ranks.py", "nerf/runtime/profiler.py", "nerf/runtime/machine_rates.py", "nerf/training/pixel_sampler.py",
+    "nerf/runtime/ranks.py", "nerf/runtime/profiler.py", "nerf/runtime/machine_rates.py",
+    "nerf/training/pixel_sampler.py",
 }  # fmt: skip
 # Measured as the rows of the functions they repeat.
 REPEATED = ("nerf/kernels/warp/",)

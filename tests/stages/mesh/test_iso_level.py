@@ -61,7 +61,7 @@ def test_the_surface_lies_at_the_median_depth_whatever_the_density(rays, inside)
     assert "e+" not in chosen.reason
     radii = np.linalg.norm(extract_surface(grid, chosen.density).vertices, axis=1)
     assert abs(radii.mean() - 0.55) < VOXEL
-    assert "rays of the photos lose half of their transmittance" in chosen.reason
+    assert "rays of the photos falls to one half" in chosen.reason
 
 
 def test_the_level_scales_with_density_and_inversely_with_length(rays):
