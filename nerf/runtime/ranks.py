@@ -1,7 +1,7 @@
 """Several processes that compute one training (*ranks*, by torch.distributed): what they tell each other.
 
-Rank 0 leads: it alone decides what is done next, and the others listen. Only a training by several ranks imports this
-module.
+Rank 0 leads: it alone decides what is done next, and the others listen. A training by one process makes no
+:class:`Ranks` and initialises nothing here.
 """
 
 import time
