@@ -7,6 +7,7 @@ what rigs and frames say of poses is in images, too, and tracks are what images 
 
 import codecs
 import math
+import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -42,6 +43,7 @@ PARAMETERS = dict(CAMERA_MODELS.values())
 MAX_SIDE = 2**31 - 1
 MAX_COORDINATE = 1e30  # of anything, in its units: squares and products of three such numbers are numbers, too
 NO_POINT = -1
+LINE_END = re.compile(r"\r\n|\r|\n")  # a lone \r is of old Macs; str.splitlines ends lines elsewhere, too
 UNKNOWN_ERROR = "0"  # of a point in text that ends with its colour
 
 Entry = TypeVar("Entry")
@@ -239,7 +241,7 @@ def _lines(path: Path) -> list[_Line]:
     data = path.read_bytes()
     is_utf16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # as PowerShell redirects text
     text = data.decode("utf-16" if is_utf16 else "utf-8-sig", "backslashreplace")
-    return [_Line(i, line) for i, line in enumerate(text.split("\n"), 1) if not line.lstrip().startswith("#")]
+    return [_Line(i, line) for i, line in enumerate(LINE_END.split(text), 1) if not line.lstrip().startswith("#")]
 
 
 def _filled(path: Path) -> list[_Line]:
@@ -298,7 +300,12 @@ def _text_images(path: Path) -> Iterator[tuple[int, FileImage]]:
             raise follows.damaged("keypoints are triples, x, y and the id of a point or -1")
         xy = np.array(_numbers(follows, [v for i, v in enumerate(seen) if i % 3 < 2], float)).reshape(-1, 2)
         points = np.array(_numbers(follows, seen[2::3], _whole), np.int64)
-        yield number, FileImage(line.text.split(maxsplit=9)[9].strip(), camera, pose, xy, points)
+        yield number, FileImage(_unquoted(line.text.split(maxsplit=9)[9].strip()), camera, pose, xy, points)
+
+
+def _unquoted(name: str) -> str:
+    """A name without quotation marks around it: no photo's ending has one."""
+    return name[1:-1] if len(name) > 2 and name[0] == name[-1] and name[0] in "\"'" else name
 
 
 def _is_image(line: _Line) -> bool:

@@ -18,6 +18,8 @@ from stages.io.files import write_durably
 MIN_MISSING_TO_START_OVER = 0.1  # of all; for features and fisheye two at least, since one may well be a stranger
 # Nor is mapping again, minutes of many images, worth a blurred one among them: the others show what it shows.
 MIN_MISSING_TO_RETRY = 0.02
+# Of the photo's longer side: 36 mm in the 35-mm format, where a fisheye of 180 degrees has 16.
+MIN_LONG_FOCAL = 1.0
 # Camera model selection and final bundle adjustment take 0.8 to 1.6 times as long as mapping
 # (docs/experiments/camera_models.md).
 FINAL_ADJUSTMENT_FACTOR = 2.0
@@ -208,6 +210,7 @@ class Situation(NamedTuple):
     their matches with registered images, or with each other if none is registered, are enough to register one.
     ``planar``: there is no model, and nearly all pairs are planar or pure rotations. ``sequence_broken``: the sequence
     of photos is broken in a model. ``misfit``: the best model does not fit its matches, so all images count as missing.
+    ``long_lenses``: EXIF tells of every photo a focal length beyond MIN_LONG_FOCAL.
     """
 
     missing: int
@@ -218,6 +221,7 @@ class Situation(NamedTuple):
     camera_model_is_given: bool
     sequence_broken: bool = False
     misfit: bool = False
+    long_lenses: bool = False
 
 
 def reason_against(strategy: Strategy, now: Situation) -> str | None:
@@ -232,6 +236,8 @@ def reason_against(strategy: Strategy, now: Situation) -> str | None:
         return "the missing photos share too few matches with the others"
     if strategy.matches == "fisheye" and now.camera_model_is_given:
         return "the camera model is given"
+    if strategy.matches == "fisheye" and now.long_lenses:
+        return "no fisheye has focal lengths as long as EXIF tells"
     if now.missing < MIN_MISSING_TO_RETRY * now.images:
         return f"mapping again is not worth it for {now.missing} of {now.images} photos"
     from_nothing = strategy.matches in ("fisheye", "more features")

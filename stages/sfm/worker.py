@@ -24,6 +24,7 @@ from stages.sfm.job import Job, JobState, Send, end_with_parent
 from stages.sfm.mapping import run_mapping
 from stages.sfm.matching import capture_sequence, match_photos
 from stages.sfm.retry_strategies import (
+    MIN_LONG_FOCAL,
     NO_TIME,
     STRATEGIES,
     Outcome,
@@ -151,7 +152,12 @@ def _why_useless(strategy: Strategy, missing: list[int], state: JobState) -> str
     alone = {state.files[number] for number in missing}.difference(*groups)
     count, given = len(state.photos), state.job.camera_model is not None
     planar &= len(missing) == count
-    now = Situation(len(missing), len(alone), count, linked, planar, given, _sequence_broken(state), misfit)
+    long_lenses = all(
+        photo.focal_px is not None and photo.focal_px > MIN_LONG_FOCAL * max(photo.width, photo.height)
+        for photo in state.photos
+    )
+    broken = _sequence_broken(state)
+    now = Situation(len(missing), len(alone), count, linked, planar, given, broken, misfit, long_lenses)
     return reason_against(strategy, now)
 
 

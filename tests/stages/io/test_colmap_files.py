@@ -147,8 +147,10 @@ def test_a_damaged_line_is_named(name: str, line: str, why: str, tmp_path: Path)
         read_model(tmp_path)
 
 
-def test_text_that_can_only_mean_one_thing(tmp_path: Path) -> None:
-    """Whole numbers such as 1.0, camera models in small letters, points that end with their colour, UTF-16."""
+@pytest.mark.parametrize("line_end", ["\n", "\r\n", "\r"])
+def test_text_that_can_only_mean_one_thing(line_end: str, tmp_path: Path) -> None:
+    """Whole numbers such as 1.0, camera models in small letters, points that end with their colour, quoted names,
+    UTF-16, any end of line."""
     whole = read_model(written(tmp_path))
     files = {name: tmp_path / f"{name}.txt" for name in ("cameras", "images", "points3D")}
     rows = {name: [line.split() for line in file.read_text().splitlines()] for name, file in files.items()}
@@ -156,10 +158,13 @@ def test_text_that_can_only_mean_one_thing(tmp_path: Path) -> None:
         if row[0] != "#":
             row[0], row[1], row[2], row[3] = f"{row[0]}.0", row[1].lower(), f"{row[2]}.0", f"{row[3]}e0"
     rows["points3D"] = [row[:7] for row in rows["points3D"]]
+    for row in rows["images"]:
+        if len(row) == 10 and row[0] != "#":
+            row[9] = f'"{row[9]}"'
     for name, file in files.items():
-        file.write_text("\r\n".join(map(" ".join, rows[name])), "utf-16")
+        file.write_text(line_end.join(map(" ".join, rows[name])), "utf-16", newline="")
     read = read_model(tmp_path)
-    assert read.cameras == whole.cameras and len(read.images) == len(whole.images)
+    assert read.cameras == whole.cameras and [image.file for image in read.images] == [i.file for i in whole.images]
     np.testing.assert_array_equal(read.xyz, whole.xyz)
     np.testing.assert_array_equal(read.rgb, whole.rgb)
     np.testing.assert_array_equal(read.xy, whole.xy)

@@ -124,6 +124,8 @@ APART = "form models of their own"
         ("more features", {"missing": 150, "alone": 3, "images": 300}, None),
         ("fisheye", {"missing": 40}, None),
         ("fisheye", {"missing": 40, "camera_model_is_given": True}, "the camera model is given"),
+        ("fisheye", {"missing": 40, "long_lenses": True}, "no fisheye has"),
+        ("relaxed ratio test", {"missing": 40, "long_lenses": True}, None),
         ("fisheye", {"missing": 4}, "starting over is not worth it for 4 of 50"),
         ("weaker initial pair", {"missing": 1, "images": 51}, "mapping again is not worth it for 1 of 51"),
         ("relaxed ratio test", {"missing": 5, "images": 300}, "mapping again is not worth it for 5 of 300"),
