@@ -1,6 +1,7 @@
 """From photos to the matches that a strategy maps. Runs in the worker process of stage sfm."""
 
 import shutil
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -83,9 +84,14 @@ def _extract(database: Path, extraction: ExtractionOptions, state: JobState) -> 
     masks = Path(state.job.folder, "masks")
     if write_feature_masks(state.images.parent, state.photos, masks):
         extraction = extraction._replace(masks=masks)
-    extract_features(database, state.images, state.photos, extraction)
+    extract_features(database, state.images, state.photos, extraction, partial(_tell_few, state))
     shutil.rmtree(masks, ignore_errors=True)
     state.end("features")
+
+
+def _tell_few(state: JobState, median: float) -> None:
+    what = f"the photos yield few features, {median:,.0f} each: features are extracted from four times the pixels"
+    state.send(note=Note("sfm.features-enlarged", what))
 
 
 def _match_all(database: Path, state: JobState) -> dict[str, Any] | None:

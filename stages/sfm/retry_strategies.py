@@ -76,6 +76,7 @@ STRATEGIES = (
         WEAK_INITIAL_PAIR,
     ),
 )
+STRICT = tuple(strategy.name for strategy in STRATEGIES if strategy.matches not in ("relaxed", "same"))
 
 
 @dataclass(frozen=True)
@@ -139,6 +140,11 @@ class StrategyLog:
     def best(self) -> Outcome | None:
         """The best outcome that has a model; of equals the first."""
         return max((one for one in self.outcomes if one.groups), key=lambda one: one.rank, default=None)
+
+    def sequence_broken(self) -> bool:
+        """Whether the sequence of photos was broken in a model of strict matches. Relaxed ones, which the strategies of
+        the same matches map again, hold enough false ones to break any."""
+        return any(one.sequence_broken and one.name in STRICT for one in self.outcomes)
 
     def report(self) -> list[dict[str, Any]]:
         """What registration.json says of each strategy that was tried or skipped; one of those tried is kept."""

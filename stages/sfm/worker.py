@@ -124,7 +124,7 @@ def _try_strategies(state: JobState) -> None:
         log.skipped.pop(strategy.name, None)  # of an interrupted run that had less time
         if strategy not in STRATEGIES[: state.job.max_strategies] or not (missing := state.missing()):
             continue
-        if strategy.matches == "consecutive" and not _sequence_broken(state):
+        if strategy.matches == "consecutive" and not state.log.sequence_broken():
             continue
         if strategy.name == STRATEGIES[0].name:
             _try(strategy, missing, state)
@@ -156,7 +156,7 @@ def _why_useless(strategy: Strategy, missing: list[int], state: JobState) -> str
         photo.focal_px is not None and photo.focal_px > MIN_LONG_FOCAL * max(photo.width, photo.height)
         for photo in state.photos
     )
-    broken = _sequence_broken(state)
+    broken = state.log.sequence_broken()
     now = Situation(len(missing), len(alone), count, linked, planar, given, broken, misfit, long_lenses)
     return reason_against(strategy, now)
 
@@ -165,11 +165,6 @@ def _is_misfit(state: JobState) -> bool:
     """Whether even the best model does not fit its verified matches."""
     best = state.usable()
     return best is not None and not best.fits
-
-
-def _sequence_broken(state: JobState) -> bool:
-    """Whether the sequence of photos was broken in the model of a strategy."""
-    return any(outcome.sequence_broken for outcome in state.log.outcomes)
 
 
 def _why_infeasible(strategy: Strategy, missing: list[int], state: JobState) -> str | None:

@@ -2,6 +2,7 @@
 
 import math
 import shutil
+import tempfile
 import time
 from collections.abc import Callable, Container, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +18,7 @@ from jaxtyping import Bool
 
 from stages.hardware.device import processors
 from stages.hardware.memory import at_once
-from stages.io.photos import Photo
+from stages.io.photos import Photo, spread
 from stages.sfm.pairs.feature_matching import IndexedFeatures, index_features, match_descriptors, match_indexed
 from stages.sfm.pairs.image_retrieval import WORDS, Words, photo_similarity, vocabulary
 from stages.sfm.pairs.pair_selection import Pairs, SimilarityMatrix
@@ -30,6 +31,9 @@ RELAXED_RATIO = 0.9
 BLOCK_SIZE = 32  # pairs of photos that are committed at once (progress, resuming)
 FISHEYE_MODEL = "SIMPLE_RADIAL_FISHEYE"
 FISHEYE_ANGLE_DEG = 150.0
+FIRST_MODEL = "SIMPLE_RADIAL"  # of a database for features alone, which ask for no camera
+# Of the maximum: where the median of so many photos has fewer, photos are enlarged (docs/experiments/few_features.md).
+MIN_FEATURES_SHARE, COUNTED_PHOTOS = 0.25, 12
 BYTES_PER_PIXEL = 100  # 77 to 86 measured on photos of 1024 to 3200 pixels
 OPENINGS, PAUSE_SECONDS = 50, 0.1  # a reader holds the lock for milliseconds
 CACHED_PHOTOS = 256  # whose features are held in memory, about half a megabyte each
@@ -109,36 +113,95 @@ class ExtractionOptions(NamedTuple):
     masks: Path | None = None
     doubled_up_to: int = 1024
 
+    def doubles(self, photo: Photo) -> bool:
+        """Whether a photo is doubled before its features are extracted."""
+        return max(photo.width, photo.height) <= self.doubled_up_to
+
+    def larger(self) -> "ExtractionOptions":
+        """Twice as many from about four times the pixels: of large photos their own, of others doubled ones."""
+        twice = {"max_image_size": 2 * self.max_image_size, "max_features": 2 * self.max_features}
+        return self._replace(**twice, doubled_up_to=3 * self.max_image_size // 2)
+
 
 def feature_bytes(photos: Sequence[Photo], extraction: ExtractionOptions) -> float:
     """Memory that feature extraction takes for the largest of the photos, by its pixels as they are used."""
 
     def used_pixels(photo: Photo) -> float:
         longer = max(photo.width, photo.height)
-        scale = min(1.0, extraction.max_image_size / longer) * (2 if longer <= extraction.doubled_up_to else 1)
+        scale = min(1.0, extraction.max_image_size / longer) * (2 if extraction.doubles(photo) else 1)
         return photo.width * photo.height * scale**2
 
     return BYTES_PER_PIXEL * max(map(used_pixels, photos))
 
 
-def extract_features(database: Path, images: Path, photos: Sequence[Photo], extraction: ExtractionOptions) -> None:
+def extract_features(
+    database: Path,
+    images: Path,
+    photos: Sequence[Photo],
+    extraction: ExtractionOptions,
+    on_few: Callable[[float], None] = lambda median: None,
+) -> None:
     """SIFT keypoints and descriptors of every photo that has none yet, where ``masks/<image name>.png`` is not black,
     or anywhere where that is not there.
 
     The scale space begins at the photos' own size. Doubling them first, as is COLMAP's habit, costs 4.5 times as
-    much and moves no camera of a well-sized photo (benchmarks/sfm_accuracy.py), so only small ones are doubled.
+    much and moves no camera of a well-sized photo (benchmarks/sfm_accuracy.py), so only small ones are doubled. Where
+    half of some photos yield few features, as smooth or dark things do, all are enlarged: those of an enlarged photo
+    hardly match those of another that is not. ``on_few`` is told then what the photos yield at their own size.
     """
+    with pycolmap.Database.open(database) as db:
+        todo = [number for number in range(len(photos)) if not db.exists_descriptors(number + 1)]
+    large = [number for number, photo in enumerate(photos) if not extraction.doubles(photo)]
+    if todo and large:
+        some = [large[place] for place in spread(len(large), min(len(large), COUNTED_PHOTOS))]
+        with tempfile.TemporaryDirectory(dir=database.parent) as folder:
+            counted = Path(folder, "some.db")
+            fill_database(counted, [photos[number] for number in some], FIRST_MODEL)
+            _extract(counted, images, [photos[number] for number in some], extraction)
+            yielded = _median_features(counted, len(some))
+            if yielded < MIN_FEATURES_SHARE * extraction.max_features:
+                on_few(yielded)
+                extraction = extraction.larger()
+            else:
+                _copy_features(counted, database, some)
+    _extract(database, images, [photos[number] for number in todo], extraction)
+
+
+def _median_features(database: Path, count: int) -> float:
+    with pycolmap.Database.open(database) as db:
+        return float(np.median([db.num_keypoints_for_image(image_id) for image_id in range(1, count + 1)]))
+
+
+def _copy_features(source: Path, target: Path, numbers: Sequence[int]) -> None:
+    """Copy the features of photos that have none yet; ``numbers``, from 0, are those of ``source``'s photos in
+    ``target``."""
+    with (
+        pycolmap.Database.open(source) as read,
+        pycolmap.Database.open(target) as written,
+        pycolmap.DatabaseTransaction(written),
+    ):
+        for own_id, image_id in enumerate((number + 1 for number in numbers), 1):
+            if not written.exists_descriptors(image_id):
+                written.write_keypoints(image_id, read.read_keypoints(own_id))
+                written.write_descriptors(image_id, read.read_descriptors(own_id))
+
+
+def _extract(database: Path, images: Path, photos: Sequence[Photo], extraction: ExtractionOptions) -> None:
+    """The features of these photos, whatever they yield. Those of photos that have some are left alone."""
+    if not photos:
+        return
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = extraction.max_image_size
     options.sift.max_num_features = extraction.max_features
     options.num_threads = at_once(processors(), feature_bytes(photos, extraction))
-    every = [photo.image_name for photo in photos]
-    small = {p.image_name for p in photos if max(p.width, p.height) <= extraction.doubled_up_to}
+    small = {photo.image_name for photo in photos if extraction.doubles(photo)}
     masks = extraction.masks
-    masked = {name for name in every if masks and (masks / f"{name}.png").is_file()}
+    masked = {p.image_name for p in photos if masks and (masks / f"{p.image_name}.png").is_file()}
     # A photo without a mask has to go without a folder of masks: one that is not there is an error to COLMAP.
     for is_small, is_masked in product((True, False), (False, True)):
-        names = [name for name in every if (name in small, name in masked) == (is_small, is_masked)]
+        names = [
+            p.image_name for p in photos if (p.image_name in small, p.image_name in masked) == (is_small, is_masked)
+        ]
         if not names:
             continue
         options.sift.first_octave = -1 if is_small else 0

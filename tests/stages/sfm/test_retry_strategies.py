@@ -99,6 +99,16 @@ def test_strategies_that_ended_the_worker_are_remembered(tmp_path: Path) -> None
     assert abandoned == {"global mapping": "ended the program", "fisheye": "ran out of time"}
 
 
+@pytest.mark.parametrize(
+    ("name", "broken"),
+    [("default", True), ("more features", True), ("relaxed ratio test", False), ("other seed", False)],
+)
+def test_only_strict_matches_break_a_sequence(name: str, broken: bool, tmp_path: Path) -> None:
+    log = StrategyLog(tmp_path / "strategies")
+    log.add(Outcome(name, "x.db", sequence_broken=True))
+    assert log.sequence_broken() == broken
+
+
 PLAIN = Situation(missing=5, alone=5, images=50, linked=True, planar=False, camera_model_is_given=False)
 TOO_LITTLE = "the missing photos share too few matches"
 APART = "form models of their own"

@@ -7,10 +7,18 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
 
 import stages.sfm.colmap.database as database_module
 from stages.io.photos import Photo
-from stages.sfm.colmap.database import fill_database, image_similarity, keep_open, match_pairs
+from stages.sfm.colmap.database import (
+    ExtractionOptions,
+    extract_features,
+    fill_database,
+    image_similarity,
+    keep_open,
+    match_pairs,
+)
 from stages.sfm.colmap.diagnosis import links
 from stages.sfm.pairs.pair_selection import exhaustive
 from tests.stages.sfm.pairs.test_feature_matching import random_descriptors
@@ -172,3 +180,60 @@ def test_an_open_database_can_be_read_along(database: Path) -> None:
     finally:
         reader.kill()
         reader.wait()
+
+
+def pictures(folder: Path, busy: int, plain: int) -> list[Photo]:
+    """So many photos of 480 × 360 with large discs on grey, which are features of their own size, and with small faint
+    ones, few of which are."""
+    random, photos = np.random.default_rng(0), []
+    v, u = np.mgrid[:360, :480]
+    for number in range(busy + plain):
+        sigma, contrast = (3.0, 90.0) if number < busy else (1.5, 40.0)
+        light = np.full((360, 480), 100.0)
+        for x, y in random.uniform((10, 10), (470, 350), (300, 2)):
+            light += contrast * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * sigma**2))
+        name = f"{number}.png"
+        Image.fromarray(light.clip(0, 255).astype(np.uint8)).save(folder / name)
+        photos.append(Photo(name, f"images/{name}", 480, 360, 0, None, None, False, 1.0))
+    return photos
+
+
+ASKED = ExtractionOptions(max_image_size=480, max_features=400, doubled_up_to=240)
+
+
+def features_of(folder: Path, photos: list[Photo], name: str) -> list[np.ndarray]:
+    """The keypoints of each photo, in a database of this name, which goes on where there is one."""
+    database = folder / f"{name}.db"
+    fill_database(database, photos, "SIMPLE_RADIAL")
+    extract_features(database, folder, photos, ASKED)
+    with pycolmap.Database.open(database) as db:
+        ids = range(1, len(photos) + 1)
+        assert all(db.num_descriptors_for_image(i) == db.num_keypoints_for_image(i) for i in ids)
+        return [np.array(db.read_keypoints(i), float).reshape(-1, 6) for i in ids]
+
+
+@pytest.mark.parametrize(("busy", "plain", "enlarged"), [(2, 1, False), (1, 2, True)])
+def test_photos_are_enlarged_where_most_yield_few_features(
+    busy: int, plain: int, enlarged: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos = pictures(tmp_path, busy, plain)
+    found = features_of(tmp_path, photos, "found")
+    monkeypatch.setattr(database_module, "MIN_FEATURES_SHARE", 0.0)
+    own_size = features_of(tmp_path, photos, "own-size")
+    if enlarged:
+        assert all(len(own) < 100 < 400 < len(more) for own, more in zip(own_size[busy:], found[busy:], strict=True))
+    else:
+        assert all(np.array_equal(own, same) for own, same in zip(own_size, found, strict=True))
+
+
+def test_extraction_that_was_interrupted_goes_on(tmp_path: Path) -> None:
+    photos = pictures(tmp_path, 2, 0)
+    whole = features_of(tmp_path, photos, "whole")
+    fill_database(tmp_path / "again.db", photos, "SIMPLE_RADIAL")
+    kind = pycolmap.FeatureExtractorType.SIFT
+    with pycolmap.Database.open(tmp_path / "again.db") as db:  # the first photo is done, with features of its own
+        db.write_keypoints(1, np.ones((3, 6), np.float32))
+        db.write_descriptors(1, pycolmap.FeatureDescriptors(data=np.ones((3, 128), np.uint8), type=kind))
+    done, other = features_of(tmp_path, photos, "again")
+    assert len(done) == 3
+    np.testing.assert_array_equal(other, whole[1])
