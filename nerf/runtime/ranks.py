@@ -50,10 +50,6 @@ class Ranks:
         ranks.waited_seconds = 0.0
         return ranks
 
-    def leave(self) -> None:
-        """Take part no longer. The others notice when they next wait for this rank."""
-        dist.destroy_process_group()
-
     @contextmanager
     def _waiting(self) -> Iterator[None]:
         """torch.distributed raises RuntimeError, or something derived from it, where another rank is gone."""
@@ -122,6 +118,13 @@ class Ranks:
         with self._waiting():
             dist.all_gather_object(gathered, own)
         return gathered
+
+
+def leave() -> None:
+    """Take part no longer, as far as this process does: joining may have failed. The others notice when they next wait
+    for this rank."""
+    if dist.is_initialized():
+        dist.destroy_process_group()
 
 
 def packed(tensors: Sequence[Tensor]) -> UInt8[Tensor, "bytes"]:

@@ -101,7 +101,7 @@ def leading(devices: int, task: dict[str, Any]) -> "Iterator[Ranks]":
     from torch.distributed import TCPStore  # pyright: ignore[reportPrivateImportUsage]
     from torch.distributed.distributed_c10d import PrefixStore
 
-    from nerf.runtime.ranks import RankLost
+    from nerf.runtime.ranks import RankLost, leave
 
     size, children = rank_count(devices), dict[int, Child]()
     if launched().size > 1:
@@ -117,7 +117,7 @@ def leading(devices: int, task: dict[str, Any]) -> "Iterator[Ranks]":
     except RankLost as error:
         raise lost_rank(_ended(children, wait=ENDING_SECONDS) or str(error)) from error
     finally:
-        _leave()
+        leave()
         for child, complaints in children.values():
             _end(child)
             complaints.close()
@@ -135,6 +135,8 @@ def tasks_of_first_rank() -> "Iterator[tuple[dict[str, Any], Ranks]]":
     0."""
     from torch.distributed.distributed_c10d import PrefixStore
 
+    from nerf.runtime.ranks import leave
+
     _take_device()
     number, store = 0, _store_of_launcher()
     while True:
@@ -149,7 +151,7 @@ def tasks_of_first_rank() -> "Iterator[tuple[dict[str, Any], Ranks]]":
         try:
             yield task, _joined(PrefixStore("group", numbered), launched())
         finally:
-            _leave()
+            leave()
         number += 1
 
 
@@ -159,13 +161,6 @@ def _joined(store: "Store", place: Place) -> "Ranks":
     from nerf.runtime.ranks import Ranks
 
     return Ranks.join(store, place.rank, place.size, torch.device(compute_device()))
-
-
-def _leave() -> None:
-    import torch.distributed
-
-    if torch.distributed.is_initialized():
-        torch.distributed.destroy_process_group()
 
 
 def _next_task() -> int:

@@ -18,7 +18,7 @@ from nerf.effects.vignetting import VignettingModel
 from nerf.fields.hash_grid import HashGridField
 from nerf.geometry.space_maps import Contraction
 from nerf.kernels import torch as reference
-from nerf.runtime.ranks import Ranks, packed, packed_bytes, unpacker
+from nerf.runtime.ranks import Ranks, leave, packed, packed_bytes, unpacker
 from nerf.training.data_parallel import LeadingTrainer, end_others, follow_first_rank
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite
@@ -64,7 +64,7 @@ def other_rank(port: int, kind: str) -> None:
 
     ranks = Ranks.join(TCPStore("127.0.0.1", port, is_master=False), 1, 2, device)
     follow_first_rank(ranks, make)
-    ranks.leave()
+    leave()
 
 
 @pytest.fixture(scope="module", params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
@@ -77,7 +77,7 @@ def ranks(request: pytest.FixtureRequest) -> Iterator[Ranks]:
     joined = Ranks.join(store, 0, 2, torch.device(request.param))
     yield joined
     end_others(joined)
-    joined.leave()
+    leave()
     child.join(60)
     assert child.exitcode == 0
 
