@@ -142,6 +142,16 @@ class Progress(Protocol):
         ...
 
 
+class SilentProgress:
+    """A :class:`Progress` that says nothing."""
+
+    def update(self, message: str, done: float | None = None) -> None:
+        """Say nothing."""
+
+    def note(self, code: str, text: str) -> None:
+        """Say nothing."""
+
+
 @dataclass(frozen=True)
 class StageResult:
     """What a stage hands back once its files are written.

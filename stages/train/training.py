@@ -19,7 +19,7 @@ from nerf.training.evaluation_pixels import sample_evaluation_pixels
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import FieldTrainer
-from stages.contract import Inputs, Progress, StageError, StageResult
+from stages.contract import Inputs, Progress, SilentProgress, StageError, StageResult
 from stages.effects.decisions import read_decisions
 from stages.effects.image_effects import image_effects, learnt_effects
 from stages.hardware.device import compute_device, cores
@@ -86,16 +86,6 @@ def ranks_of(config: Config, inputs: Inputs) -> Iterator[Ranks | None]:
             end_others(ranks)
 
 
-class _Silent:
-    """The progress of a rank that is not the first."""
-
-    def update(self, message: str, done: float | None = None) -> None:
-        """Say nothing."""
-
-    def note(self, code: str, text: str) -> None:
-        """Say nothing."""
-
-
 def follow() -> None:
     """Be one of the other ranks: train with rank 0 whenever it asks for it, until it ends."""
     for task, ranks in tasks_of_first_rank():
@@ -107,16 +97,13 @@ def follow() -> None:
 
 def _trainers_later(config: Config, inputs: Inputs) -> Callable[[], Callable[[int], FieldTrainer]]:
     """Reads the photos at the first call, which comes when rank 0 has its trainer and so has filled the pixel store."""
-    assert config.downscale is not None, "plan() chooses it"
-    scene, downscale = read_scene(inputs["normalise"]), config.downscale
+    scene = read_scene(inputs["normalise"])
     if config.target_psnr is not None:
         scene = with_validation_split(scene)
-    depth = inputs["depth"] if config.depth else None
 
     @cache
     def trainers() -> Callable[[int], FieldTrainer]:
-        dataset = guided_dataset(inputs, scene, downscale, _Silent(), depth).to(compute_device())
-        return _trainers(config, scene, inputs, dataset)
+        return _trainers(config, scene, inputs, _dataset(config, scene, inputs, SilentProgress()))
 
     return trainers
 
@@ -147,14 +134,12 @@ def prepare(
     config: Config, scene: Scene, inputs: Inputs, folder: Path, progress: Progress, ranks: Ranks | None = None
 ) -> TrainingRun:
     """Photos, evaluation pixels, budget and trainer of a run. Raises StageError if the field takes too much memory."""
-    assert config.downscale is not None, "plan() chooses it"
     device = compute_device()
     if device == "cpu":
         field = field_of(config)
         check_memory(field.memory_bytes(config, cores()), "the field", *field.memory_advice(config))
     progress.update("reading the photos")
-    depth = inputs["depth"] if config.depth else None
-    dataset = guided_dataset(inputs, scene, config.downscale, progress, depth).to(device)
+    dataset = _dataset(config, scene, inputs, progress)
     if dataset.depth_maps is not None:
         known = float((dataset.depth_maps.distance > 0).float().mean())
         progress.note("train.depth-maps", f"depth maps know the distance of {known:.0%} of the pixels")
@@ -182,6 +167,13 @@ def prepare(
         TrainingLog(folder, config.tensorboard),
         progress,
     )
+
+
+def _dataset(config: Config, scene: Scene, inputs: Inputs, progress: Progress) -> RayDataset:
+    """The training photos, on the device that trains."""
+    assert config.downscale is not None, "plan() chooses it"
+    depth = inputs["depth"] if config.depth else None
+    return guided_dataset(inputs, scene, config.downscale, progress, depth).to(compute_device())
 
 
 def _trainers(config: Config, scene: Scene, inputs: Inputs, dataset: RayDataset) -> Callable[[int], FieldTrainer]:
