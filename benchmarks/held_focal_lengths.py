@@ -24,7 +24,7 @@ from stages.sfm.colmap.database import verify_again
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.mapping import incremental_options, map_incrementally
 from stages.sfm.colmap.repair import check_model
-from stages.sfm.colmap.thinning import thin_matches
+from stages.sfm.colmap.thinning import set_focal_length, thin_matches
 from stages.sfm.retry_strategies import STRATEGIES
 
 
@@ -48,7 +48,7 @@ def main() -> None:
             told = thin_matches(database, thinned)
             calibrated = focal_length(thinned)
             for factor in asked.focal:
-                set_focal_length(thinned, factor * calibrated)
+                begin_with(thinned, factor * calibrated)
                 for seed in asked.seeds:
                     for held in (False, True):
                         figures = mapped(thinned, database, asked.images, seed, held)
@@ -102,11 +102,11 @@ def focal_length(database: Path) -> float:
         return db.read_camera(1).mean_focal_length()
 
 
-def set_focal_length(database: Path, focal_px: float) -> None:
+def begin_with(database: Path, focal_px: float) -> None:
     """Let mapping begin with this focal length."""
     with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
         camera = db.read_camera(1)
-        camera.params = [focal_px, *np.array(camera.params)[1:].tolist()]
+        set_focal_length(camera, focal_px)
         db.update_camera(camera)
 
 

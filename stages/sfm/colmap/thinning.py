@@ -110,7 +110,7 @@ def calibrate_focal_lengths(database: Path) -> bool:
             focal_px, known = told.get(camera.camera_id), camera.has_prior_focal_length
             if focal_px is None or (known and not _far_apart(focal_px, camera.mean_focal_length(), MAX_EXIF_RATIO)):
                 continue
-            _set_focal_length(camera, focal_px)
+            set_focal_length(camera, focal_px)
             camera.has_prior_focal_length = True
             db.update_camera(camera)
     return len(told) == len(cameras)
@@ -121,7 +121,7 @@ def _calibrated(database: Path, factor: float) -> dict[int, float]:
     copy = unfinished_copy(database, database.with_name(f"{database.stem}-calibration.db"))
     with pycolmap.Database.open(copy) as db, pycolmap.DatabaseTransaction(db):
         for camera in db.read_all_cameras():
-            _set_focal_length(camera, factor * FOCAL_GUESS * max(camera.width, camera.height))
+            set_focal_length(camera, factor * FOCAL_GUESS * max(camera.width, camera.height))
             camera.has_prior_focal_length = False  # those that count as known are not calibrated
             db.update_camera(camera)
     options = pycolmap.ViewGraphCalibrationOptions(random_seed=0, reestimate_relative_pose=False)
@@ -137,7 +137,8 @@ def _far_apart(one: float, other: float, max_ratio: float) -> bool:
     return not 1 / max_ratio < one / other < max_ratio
 
 
-def _set_focal_length(camera: pycolmap.Camera, focal_px: float) -> None:
+def set_focal_length(camera: pycolmap.Camera, focal_px: float) -> None:
+    """In place; its other parameters stay."""
     params = np.array(camera.params)
     params[camera.focal_length_idxs()] = focal_px
     camera.params = params.tolist()
