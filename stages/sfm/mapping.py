@@ -11,7 +11,7 @@ from stages.sfm import global_mapping
 from stages.sfm.colmap.database import adopt_cameras
 from stages.sfm.colmap.diagnosis import compare_models, disagree
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
-from stages.sfm.colmap.joining import join_pieces
+from stages.sfm.colmap.joining import Piece, join_pieces
 from stages.sfm.colmap.mapping import incremental_options, map_globally, map_incrementally
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import (
@@ -34,6 +34,18 @@ from stages.sfm.matching import capture_sequence, consecutive_pairs
 from stages.sfm.retry_strategies import STRATEGIES, MappingOptions, Strategy
 
 MIN_PHOTOS_OF_CAMERA = 10  # in a row, for their camera to be taken for that of all
+
+
+class Runs(NamedTuple):
+    """A model, and the runs of its images (ids) that hang together by steps its matches support, the longest first."""
+
+    model: Any
+    runs: Sequence[Sequence[int]]
+
+    @property
+    def length(self) -> int:
+        """How many images hang together."""
+        return len(self.runs[0])
 
 
 class CheckedModel(NamedTuple):
@@ -115,9 +127,9 @@ def _most_steps(
     """
     known = state.job.camera_params is not None
 
-    def by_length(models: list[Any]) -> list[tuple[Any, list[list[int]]]]:
-        runs = [(model, supported_runs(model, state.database, trusted)) for model in models]
-        return sorted(runs, key=lambda one: len(one[1][0]), reverse=True)
+    def by_length(models: list[Any]) -> list[Runs]:
+        runs = [Runs(model, supported_runs(model, state.database, trusted)) for model in models]
+        return sorted(runs, key=lambda one: one.length, reverse=True)
 
     ranked = by_length(found)
     model, (longest, *_) = ranked[0]
@@ -125,21 +137,17 @@ def _most_steps(
         held = adopt_cameras(matches, model, longest)
         options = incremental_options(state.job.seed, mapping, known, state.thinned, hold_focal, held)
         again = by_length(_map_incrementally(matches, options, state))
-        ranked = max(ranked, again, key=lambda models: len(models[0][1][0]) if models else 0)
+        ranked = max(ranked, again, key=lambda models: models[0].length if models else 0)
     return _with_pieces_joined(ranked, state, trusted)
 
 
-def _with_pieces_joined(
-    ranked: Sequence[tuple[Any, Sequence[Sequence[int]]]], state: JobState, trusted: Collection[tuple[int, int]]
-) -> list[Any]:
-    """The models, each given with the runs of its photos that hang together, the one with the longest run first; before
-    them a model of joined pieces if its steps hold more photos together. It takes the place of models that have no
-    other photos."""
-    found, length = [model for model, _ in ranked], len(ranked[0][1][0])
-    joined = join_pieces(
-        [(model, run) for model, runs in ranked for run in runs], camera_is_known=state.job.camera_params is not None
-    )
-    if joined is None or len(supported_runs(joined, state.database, trusted)[0]) <= length:
+def _with_pieces_joined(ranked: Sequence[Runs], state: JobState, trusted: Collection[tuple[int, int]]) -> list[Any]:
+    """The models, the one with the longest run first; before them a model of joined pieces if its steps hold more
+    photos together. It takes the place of models that have no other photos."""
+    found = [one.model for one in ranked]
+    pieces = [Piece(one.model, run) for one in ranked for run in one.runs]
+    joined = join_pieces(pieces, camera_is_known=state.job.camera_params is not None)
+    if joined is None or len(supported_runs(joined, state.database, trusted)[0]) <= ranked[0].length:
         return found
     have = {*joined.reg_image_ids()}
     return [joined, *(model for model in found if not have.issuperset(model.reg_image_ids()))]

@@ -7,6 +7,7 @@ photos that both have, never by matches between them, which repeated structure m
 """
 
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -14,24 +15,29 @@ from jaxtyping import Float
 
 from nerf.geometry.scene import Similarity
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
-from stages.sfm.colmap.repair import deregister
+from stages.sfm.colmap.repair import restricted
 from stages.sfm.pose_check import tolerance_px
 
 MIN_SHARED = 3  # photos: the first two tell the scale between two pieces, the third whether it is right
 SCALE_ERROR = 0.05  # has to show in the photos that both pieces have: what they see may be too far away for that
 
 
-def join_pieces(
-    pieces: Iterable[tuple[pycolmap.Reconstruction, Sequence[int]]], camera_is_known: bool
-) -> pycolmap.Reconstruction | None:
+class Piece(NamedTuple):
+    """A model, and those of its images (ids) that hang together."""
+
+    model: pycolmap.Reconstruction
+    image_ids: Sequence[int]
+
+
+def join_pieces(pieces: Iterable[Piece], camera_is_known: bool) -> pycolmap.Reconstruction | None:
     """The longest piece with all others that can be joined to it, adjusted together; None where none can.
 
-    A piece is a model and those of its images (ids) that hang together. It is joined if it shares at least MIN_SHARED
+    A piece is joined if it shares at least MIN_SHARED
     photos, every one of them has the same pose in both after a similarity, and another scale would show. Where photos
     are that both have, the longer piece says.
     """
-    by_length = sorted(pieces, key=lambda piece: len(piece[1]), reverse=True)
-    waiting = [_only(model, images) for model, images in by_length if len(images) > MIN_SHARED]
+    by_length = sorted(pieces, key=lambda piece: len(piece.image_ids), reverse=True)
+    waiting = [restricted(*piece) for piece in by_length if len(piece.image_ids) > MIN_SHARED]
     if not waiting:
         return None
     first, *waiting = waiting
@@ -42,13 +48,6 @@ def join_pieces(
         return None
     release_focal_lengths(joined, joined.cameras if camera_is_known else ())
     return joined
-
-
-def _only(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> pycolmap.Reconstruction:
-    """A copy of the model in which these images alone are registered."""
-    piece = pycolmap.Reconstruction(model)
-    deregister(piece, sorted({*model.reg_image_ids()}.difference(image_ids)))
-    return piece
 
 
 def join(base: pycolmap.Reconstruction, piece: pycolmap.Reconstruction) -> pycolmap.Reconstruction | None:

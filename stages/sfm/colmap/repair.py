@@ -4,7 +4,7 @@ Call it in a worker process. stages/sfm/pose_check.py decides what contradicts a
 """
 
 import shutil
-from collections.abc import Container, Sequence
+from collections.abc import Container, Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -232,6 +232,13 @@ def deregister(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> None
     for image_id in image_ids:
         model.deregister_frame(model.image(image_id).frame_id)
     model.update_point_3d_errors()
+
+
+def restricted(model: pycolmap.Reconstruction, image_ids: Iterable[int]) -> pycolmap.Reconstruction:
+    """A copy of the model in which these images alone are registered."""
+    part = pycolmap.Reconstruction(model)
+    deregister(part, sorted({*model.reg_image_ids()}.difference(image_ids)))
+    return part
 
 
 def register_again(

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from nerf.geometry.scene import Similarity
 from stages.sfm.colmap.diagnosis import compare_models
-from stages.sfm.colmap.joining import MIN_SHARED, fit_poses, join, join_pieces
+from stages.sfm.colmap.joining import MIN_SHARED, Piece, fit_poses, join, join_pieces
 
 PHOTOS, FOCAL_PX, NOISE_PX = 24, 400.0, 0.3
 STEP, DOOR = 0.2, 1.5  # between photos, along a wall that is 1.3 to 1.8 away; between doors that look alike
@@ -75,13 +75,13 @@ def move(model: pycolmap.Reconstruction, images: Iterable[int], turn: np.ndarray
             point.xyz = moved * point.xyz
 
 
-def runs(*models: pycolmap.Reconstruction) -> list[tuple[pycolmap.Reconstruction, list[int]]]:
-    return [(model, sorted(model.reg_image_ids())) for model in models]
+def pieces_of(*models: pycolmap.Reconstruction) -> list[Piece]:
+    return [Piece(model, sorted(model.reg_image_ids())) for model in models]
 
 
 def test_pieces_that_share_photos_become_one(walk: pycolmap.Reconstruction) -> None:
     pieces = piece(walk, range(1, 11), 1), piece(walk, range(8, 19), 2), piece(walk, range(16, 25), 3)
-    joined = join_pieces(runs(*pieces), camera_is_known=False)
+    joined = join_pieces(pieces_of(*pieces), camera_is_known=False)
     assert joined is not None and joined.num_reg_images() == PHOTOS
     compared = compare_models(walk, joined)
     assert compared["agree"] == PHOTOS and compared["centre"] < 0.002 and compared["degrees"] < 0.2
@@ -95,12 +95,14 @@ def test_pieces_that_share_photos_become_one(walk: pycolmap.Reconstruction) -> N
 def test_only_what_hangs_together_is_joined(walk: pycolmap.Reconstruction) -> None:
     model = piece(walk, range(10, 25))
     move(model, range(20, 25), np.radians([0.0, 20.0, 0.0]), np.zeros(3))
-    joined = join_pieces([(piece(walk, range(1, 15)), range(1, 15)), (model, range(10, 20))], camera_is_known=False)
+    joined = join_pieces(
+        [Piece(piece(walk, range(1, 15)), range(1, 15)), Piece(model, range(10, 20))], camera_is_known=False
+    )
     assert joined is not None and sorted(joined.reg_image_ids()) == [*range(1, 20)]
 
 
 def test_known_cameras_stay(walk: pycolmap.Reconstruction) -> None:
-    pieces = runs(piece(walk, range(1, 15)), piece(walk, range(10, 25)))
+    pieces = pieces_of(piece(walk, range(1, 15)), piece(walk, range(10, 25)))
     joined = join_pieces(pieces, camera_is_known=True)
     assert joined is not None and list(joined.camera(1).params) == list(walk.camera(1).params)
 
@@ -121,8 +123,8 @@ def test_fewer_than_three_photos_join_nothing(walk: pycolmap.Reconstruction, sha
 
 
 def test_a_piece_with_nothing_to_add_is_left(walk: pycolmap.Reconstruction) -> None:
-    assert join_pieces(runs(piece(walk, range(1, 13)), piece(walk, range(5, 12))), camera_is_known=False) is None
-    assert join_pieces(runs(piece(walk, range(1, 4))), camera_is_known=False) is None
+    assert join_pieces(pieces_of(piece(walk, range(1, 13)), piece(walk, range(5, 12))), camera_is_known=False) is None
+    assert join_pieces(pieces_of(piece(walk, range(1, 4))), camera_is_known=False) is None
 
 
 @pytest.mark.parametrize(

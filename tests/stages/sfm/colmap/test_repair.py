@@ -1,7 +1,7 @@
 """COLMAP's synthetic matches and models, with known poses: check, repair, thinned matches, global mapping."""
 
 import sqlite3
-from collections.abc import Container, Iterable
+from collections.abc import Container
 from contextlib import closing
 from itertools import combinations
 from pathlib import Path
@@ -28,11 +28,12 @@ from stages.sfm.colmap.repair import (
     facts,
     reasons,
     register_again,
+    restricted,
     supported_runs,
     supported_steps,
 )
 from stages.sfm.colmap.thinning import thin_matches
-from stages.sfm.mapping import _most_steps, _with_pieces_joined
+from stages.sfm.mapping import Runs, _most_steps, _with_pieces_joined
 from stages.sfm.matching import consecutive_pairs
 from stages.sfm.retry_strategies import MappingOptions
 
@@ -259,23 +260,29 @@ def test_steps_are_judged_by_all_their_matches(made: Made, tmp_path: Path) -> No
 def test_joined_pieces_replace_models_that_have_nothing_else(made: Made) -> None:
     steps = {(i, i + 1) for i in range(1, PHOTOS)}
     state: Any = SimpleNamespace(database=made.database, job=SimpleNamespace(camera_params=None))
-    models = [only(made.model, range(1, 10)), only(made.model, range(6, 15)), only(made.model, [1, 2, *range(12, 17)])]
+    models = [
+        restricted(made.model, range(1, 10)),
+        restricted(made.model, range(6, 15)),
+        restricted(made.model, [1, 2, *range(12, 17)]),
+    ]
     models[1].transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(np.array([0.3, 1, 2])), np.array([1.0, 2, 3])))
     runs = [[*range(1, 10)]], [[*range(6, 15)]], [[*range(13, 17)], [1, 2], [12]]
-    joined, *others = _with_pieces_joined([*zip(models, runs, strict=True)], state, steps)
+    ranked = [Runs(*pair) for pair in zip(models, runs, strict=True)]
+    joined, *others = _with_pieces_joined(ranked, state, steps)
     assert sorted(joined.reg_image_ids()) == [*range(1, 15)] and others == models[2:]
     assert supported_runs(joined, made.database, steps) == [[*range(1, 15)]]
     assert compare_models(made.model, joined)["agree"] == 14
     turn(models[1], 8, degrees=3.0)  # both have it
-    assert _with_pieces_joined([*zip(models, runs, strict=True)], state, steps) == models
+    assert _with_pieces_joined(ranked, state, steps) == models
 
 
 def test_joined_pieces_have_to_hold_together(made: Made) -> None:
     """Pieces that agree are joined in vain where the matches of a step contradict it all the same."""
     steps = {(i, i + 1) for i in range(1, PHOTOS)}
     state: Any = SimpleNamespace(database=made.database, job=SimpleNamespace(camera_params=None))
-    models, runs = [only(made.model, range(6, 17)), only(made.model, range(1, 11))], [[*range(6, 17)], [*range(1, 11)]]
-    ranked = [(model, [run]) for model, run in zip(models, runs, strict=True)]
+    runs = [[*range(6, 17)], [*range(1, 11)]]
+    models = [restricted(made.model, run) for run in runs]
+    ranked = [Runs(model, [run]) for model, run in zip(models, runs, strict=True)]
     (joined,) = _with_pieces_joined(ranked, state, steps)
     assert joined.num_reg_images() == PHOTOS
     mismatch(made.database, {(8, 9)})
@@ -288,19 +295,12 @@ def test_mapping_again_holds_the_cameras_of_the_longest_piece(made: Made, tmp_pa
     set_focal_length(matches, 0.9 * FOCAL_PX, by_exif=False)
     job = SimpleNamespace(camera_params=None, seed=0, folder=str(tmp_path))
     state: Any = SimpleNamespace(database=made.database, images=tmp_path, thinned=True, send=lambda **_: None, job=job)
-    piece = only(made.model, range(1, 12))
+    piece = restricted(made.model, range(1, 12))
     (model,) = _most_steps([piece], matches, MappingOptions(), False, state, steps)
     assert supported_runs(model, made.database, steps) == [[*range(1, PHOTOS + 1)]]
     assert model.camera(1).mean_focal_length() == FOCAL_PX == focal_length(matches)
-    short = only(made.model, range(1, 9))
+    short = restricted(made.model, range(1, 9))
     assert _most_steps([short], matches, MappingOptions(), False, state, steps) == [short], "too few tell no camera"
-
-
-def only(model: Any, images: Iterable[int]) -> Any:
-    """The model with some of its images alone."""
-    part = pycolmap.Reconstruction(model)
-    deregister(part, sorted({*model.reg_image_ids()}.difference(images)))
-    return part
 
 
 def turned_alone(made: Made, image_id: int) -> Any:
