@@ -32,7 +32,7 @@ from stages.sfm.registration import (
     why_no_model,
     with_near_duplicates,
 )
-from stages.sfm.retry_strategies import LOG, read_kept, read_notes, skipped_for_time
+from stages.sfm.retry_strategies import LOG, read_kept, read_notes
 from stages.sfm.worker_process import run_worker
 
 MAX_NAMES = 5
@@ -119,7 +119,7 @@ def _reconstruct(
     )
     _remove_intermediate(folder)
     complete = all(image["registered"] for image in images)
-    return registration, "" if complete else _skipped_for_time(found["strategies"])
+    return registration, "" if complete else _skipped_for_time(found["skipped_for_time"])
 
 
 # --- checks beforehand
@@ -268,7 +268,6 @@ def _note_weak_links(photos: Sequence[Photo], links: Sequence[dict[str, Any]], p
         progress.note("sfm.few-matches", f"few matches link {listed(who, MAX_NAMES)} to the other photos")
 
 
-def _skipped_for_time(strategies: Sequence[dict[str, Any]]) -> str:
+def _skipped_for_time(count: int) -> str:
     """What the line says of strategies skipped for time: a run with more time takes this result as finished."""
-    count = skipped_for_time(strategies)
     return f" · {count} retry strateg{'y' if count == 1 else 'ies'} skipped for time: sfm --force" if count else ""

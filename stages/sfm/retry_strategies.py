@@ -23,9 +23,8 @@ MIN_LONG_FOCAL = 1.0
 # Camera model selection and final bundle adjustment take 0.8 to 1.6 times as long as mapping
 # (docs/experiments/camera_models.md).
 FINAL_ADJUSTMENT_FACTOR = 2.0
-NO_TIME, OUT_OF_TIME = "too little was left of", "ran out of time"
 MAX_SECONDS_LIMIT, TIME_GIVEN = "--sfm.max-seconds", "the time it is given (--budget or --sfm.seconds)"
-LOG, ABANDONED = "log.json", "abandoned.json"
+LOG, ABANDONED = "outcomes.json", "abandoned.json"
 
 
 class MappingOptions(NamedTuple):
@@ -110,17 +109,24 @@ class Outcome:
         return (self.fits, len(self.groups[0]), self.points, -(self.reprojection_px or 0.0))
 
 
+class Skip(NamedTuple):
+    """Why a strategy is skipped, in words, and whether it is for want of time."""
+
+    why: str
+    for_time: bool = False
+
+
 class StrategyLog:
-    """The ``outcomes`` so far, on disk, and by name why strategies were ``skipped``. ``abandoned`` says, by strategy,
-    how the worker process ended in it."""
+    """The ``outcomes`` so far, on disk, and by name why strategies were ``skipped``. ``abandoned`` are, by name, those
+    in which the worker process ended."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         outcomes, skipped = read_kept(folder / LOG) or ([], {})
         self.outcomes = [Outcome(**entry | {"excluded": read_notes(entry["excluded"])}) for entry in outcomes]
-        self.skipped: dict[str, str] = skipped
-        self.abandoned: dict[str, str] = dict(read_kept(folder / ABANDONED))
+        self.skipped = {name: Skip(*why) for name, why in skipped.items()}
+        self.abandoned = _read_abandoned(folder)
 
     def model(self, name: str) -> Path:
         """The folder of a strategy's best sub-model."""
@@ -157,8 +163,13 @@ class StrategyLog:
                 rows.append({"strategy": name, "registered": registered, **facts, "kept": one == kept, "skipped": None})
             elif name in self.skipped:
                 facts = dict.fromkeys(("registered", "points", "reprojection_px"))
-                rows.append({"strategy": name, **facts, "kept": False, "skipped": self.skipped[name]})
+                rows.append({"strategy": name, **facts, "kept": False, "skipped": self.skipped[name].why})
         return rows
+
+    def skipped_for_time(self) -> int:
+        """How many strategies were skipped, or cut short, because time was short."""
+        tried = {one.name for one in self.outcomes}
+        return sum(why.for_time for name, why in self.skipped.items() if name not in tried)
 
 
 def read_notes(kept: Mapping[str, Sequence[str]]) -> dict[str, Note]:
@@ -166,16 +177,15 @@ def read_notes(kept: Mapping[str, Sequence[str]]) -> dict[str, Note]:
     return {name: Note(*note) for name, note in kept.items()}
 
 
-def abandon(folder: Path, name: str, why: str) -> None:
+def abandon(folder: Path, name: str, why: Skip) -> None:
     """Note, in the parent process, how the worker ended in a strategy that is not to be tried again in this folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    abandoned = dict(read_kept(folder / ABANDONED)) | {name: why}
+    abandoned = _read_abandoned(folder) | {name: why}
     write_durably(folder / ABANDONED, json.dumps(sorted(abandoned.items())).encode())
 
 
-def skipped_for_time(report: Sequence[Mapping[str, Any]]) -> int:
-    """How many strategies of a :meth:`StrategyLog.report` were skipped, or cut short, because time was short."""
-    return sum((row["skipped"] or "").startswith((NO_TIME, f"it {OUT_OF_TIME}")) for row in report)
+def _read_abandoned(folder: Path) -> dict[str, Skip]:
+    return {name: Skip(*why) for name, why in read_kept(folder / ABANDONED)}
 
 
 def read_kept(path: Path) -> Any:

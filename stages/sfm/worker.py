@@ -25,10 +25,10 @@ from stages.sfm.mapping import run_mapping
 from stages.sfm.matching import capture_sequence, match_photos
 from stages.sfm.retry_strategies import (
     MIN_LONG_FOCAL,
-    NO_TIME,
     STRATEGIES,
     Outcome,
     Situation,
+    Skip,
     Strategy,
     exceeds_time,
     expected_seconds,
@@ -57,20 +57,21 @@ def reconstruct(job: Job, send: Send) -> dict[str, Any]:
     """Run structure-from-motion and write the best sub-model to ``sparse/``; nothing if none came out that is usable.
 
     Returns the ``database`` that was used in the end, the files in each sub-model, best first (``models``), the
-    ``strategies`` that were tried or skipped, and of the best model: the ``conflict`` with another one, ``points``,
-    mean ``reprojection_px``, ``camera_model``, the comparison of ``camera_models``, by file ``observations``,
-    ``uncertainty_px`` and, where a camera cannot be used, why (``left_out``), and for every unregistered image how many
-    of its features are points of the model and how many of them agree on a pose (``supports``).
+    ``strategies`` that were tried or skipped, how many of these for want of time (``skipped_for_time``), and of the
+    best model: the ``conflict`` with another one, ``points``, mean ``reprojection_px``, ``camera_model``, the
+    comparison of ``camera_models``, by file ``observations``, ``uncertainty_px`` and, where a camera cannot be used,
+    why (``left_out``), and for every unregistered image how many of its features are points of the model and how many
+    of them agree on a pose (``supports``).
     """
     state = JobState(job, send)
     state.timer.save_regularly()
     _try_strategies(state)
-    tried = state.log.report()
+    tried = {"strategies": state.log.report(), "skipped_for_time": state.log.skipped_for_time()}
     best = state.usable()
     if best is None:
         poor = state.log.best()
         models, points = (poor.groups, poor.points) if poor else ([], 0)
-        return {"database": str(state.latest()), "models": models, "points": points, "strategies": tried}
+        return {"database": str(state.latest()), "models": models, "points": points, **tried}
     send(phase="refining")
     database = state.latest()
     # From disk also where it is at hand: then a resumed run is no other.
@@ -89,7 +90,7 @@ def reconstruct(job: Job, send: Send) -> dict[str, Any]:
     write_native(Path(job.folder, "sparse"), model)
     return {
         "database": str(database),
-        "strategies": tried,
+        **tried,
         "models": [_files(model), *best.groups[1:]],
         "observations": {image.name: image.num_points3D for image in registered},
         "uncertainty_px": finished.uncertainty_px,
@@ -129,7 +130,7 @@ def _try_strategies(state: JobState) -> None:
         if strategy.name == STRATEGIES[0].name:
             _try(strategy, missing, state)
         elif why := _why_useless(strategy, missing, state):
-            log.skipped[strategy.name] = why
+            log.skipped[strategy.name] = Skip(why)
             unsaid.setdefault(why, []).append(strategy.description)
         elif why := _why_infeasible(strategy, missing, state):
             log.skipped[strategy.name] = why
@@ -167,13 +168,13 @@ def _is_misfit(state: JobState) -> bool:
     return best is not None and not best.fits
 
 
-def _why_infeasible(strategy: Strategy, missing: list[int], state: JobState) -> str | None:
+def _why_infeasible(strategy: Strategy, missing: list[int], state: JobState) -> Skip | None:
     """Why the strategy might help and is skipped all the same, which is said; None if it is tried."""
-    if became := state.log.abandoned.get(strategy.name):
+    if ended := state.log.abandoned.get(strategy.name):
         state.send(
-            note=Note("sfm.strategy-failed-before", f"not tried, because it {became} last time: {strategy.description}")
+            note=Note("sfm.strategy-failed-before", f"not tried, because {ended.why} last time: {strategy.description}")
         )
-        return f"it {became}"
+        return ended
     outcomes, (left, limit), chosen_pairs = state.log.outcomes, state.left(), state.job.matcher != "exhaustive"
     expected = expected_seconds(strategy, outcomes, len(missing) / len(state.photos), chosen_pairs)
     if not exceeds_time(expected, outcomes, left):
@@ -181,7 +182,7 @@ def _why_infeasible(strategy: Strategy, missing: list[int], state: JobState) -> 
     rest = f"{rough_duration(max(0.0, left))} of {limit} are left"
     times = f"about {rough_duration(expected)} and the final bundle adjustment, and only {rest}"
     state.send(note=Note("sfm.strategy-too-slow", f"not tried, because it takes {times}: {strategy.description}"))
-    return f"{NO_TIME} {limit}"
+    return Skip(f"too little was left of {limit}", for_time=True)
 
 
 def _try(strategy: Strategy, missing: list[int], state: JobState) -> None:

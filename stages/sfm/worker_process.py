@@ -19,7 +19,7 @@ from stages.hardware.child_process import child_environment
 from stages.io.photos import Photo
 from stages.io.stopwatch import live_line
 from stages.sfm.registration import count_done
-from stages.sfm.retry_strategies import OUT_OF_TIME, STRATEGIES, abandon
+from stages.sfm.retry_strategies import STRATEGIES, Skip, abandon
 
 if TYPE_CHECKING:
     from stages.sfm import Config
@@ -81,7 +81,8 @@ def _without(strategy: str, status: int, late: bool, log: Path) -> str | None:
         return None
     # Also where it was killed: most often for want of memory, and then it would be every time.
     became = "was killed, most likely because memory ran out" if status == -signal.SIGKILL else "ended the program"
-    abandon(log.parent / "strategies", strategy, OUT_OF_TIME if late else became)
+    ended = Skip("it ran out of time", for_time=True) if late else Skip(f"it {became}")
+    abandon(log.parent / "strategies", strategy, ended)
     return f"Run again: the strategy {strategy!r} is then skipped. Log: {log}"
 
 

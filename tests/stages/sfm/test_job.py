@@ -13,7 +13,7 @@ from stages import sfm
 from stages.contract import run_stage
 from stages.sfm import worker_process
 from stages.sfm.job import PHASE_SECONDS, Job, JobState, PhaseTimer
-from stages.sfm.retry_strategies import MAX_SECONDS_LIMIT, NO_TIME, OUT_OF_TIME, TIME_GIVEN, Outcome, skipped_for_time
+from stages.sfm.retry_strategies import MAX_SECONDS_LIMIT, TIME_GIVEN, Outcome
 from tests.refusals import refused
 from tests.stages.sfm.sfm_inputs import SMALL, ingested
 from tests.synthetic_photos import SyntheticPhotos
@@ -85,17 +85,6 @@ def test_a_misfit_registers_no_image(tmp_path: Path, fits: bool, missing: list[i
     state.files = ["a", "b", "c", "d"]
     state.log.outcomes = [Outcome("default", "matches.db", [["a", "b", "c"]], points=500, fits=fits)]
     assert state.missing() == missing
-
-
-def test_strategies_skipped_for_time_are_counted() -> None:
-    reasons = [
-        None,
-        f"{NO_TIME} {TIME_GIVEN}",
-        f"{NO_TIME} {MAX_SECONDS_LIMIT}",
-        f"it {OUT_OF_TIME}",
-        "it ended the program",
-    ]
-    assert skipped_for_time([{"skipped": reason} for reason in reasons]) == 3
 
 
 def test_a_resumed_run_knows_its_earlier_time(

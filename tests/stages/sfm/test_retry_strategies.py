@@ -7,6 +7,7 @@ from stages.sfm.retry_strategies import (
     STRATEGIES,
     Outcome,
     Situation,
+    Skip,
     StrategyLog,
     abandon,
     exceeds_time,
@@ -52,11 +53,11 @@ def test_the_log_is_read_back_and_knows_the_best(tmp_path: Path) -> None:
 def test_the_report_lists_tried_and_skipped_strategies(tmp_path: Path) -> None:
     log = StrategyLog(tmp_path / "strategies")
     log.add(Outcome("default", "x.db", [["a", "b"]], 50, 0.5))
-    log.skipped["fisheye"] = "the camera model is given"
+    log.skipped["fisheye"] = Skip("the camera model is given")
     log.add(Outcome("relaxed ratio test", "x.db", [["a", "b", "c"]], 60, 0.4))
-    log.skipped["weaker initial pair"] = "not noted: nothing was tried after it"
+    log.skipped["weaker initial pair"] = Skip("not noted: nothing was tried after it")
     again = StrategyLog(tmp_path / "strategies")
-    assert again.skipped == {"fisheye": "the camera model is given"}
+    assert again.skipped == {"fisheye": Skip("the camera model is given")}
     none = {"registered": None, "points": None, "reprojection_px": None}
     assert again.report() == [
         {"strategy": "default", "registered": 2, "points": 50, "reprojection_px": 0.5, "kept": False, "skipped": None},
@@ -93,10 +94,19 @@ def test_a_strategy_must_leave_time_for_the_final_bundle_adjustment() -> None:
 
 
 def test_strategies_that_ended_the_worker_are_remembered(tmp_path: Path) -> None:
-    for name in ("global mapping", "fisheye", "fisheye"):
-        abandon(tmp_path / "strategies", name, "ran out of time" if name == "fisheye" else "ended the program")
-    abandoned = StrategyLog(tmp_path / "strategies").abandoned
-    assert abandoned == {"global mapping": "ended the program", "fisheye": "ran out of time"}
+    ended, late = Skip("it ended the program"), Skip("it ran out of time", for_time=True)
+    for name, why in (("global mapping", ended), ("fisheye", ended), ("fisheye", late)):
+        abandon(tmp_path / "strategies", name, why)
+    assert StrategyLog(tmp_path / "strategies").abandoned == {"global mapping": ended, "fisheye": late}
+
+
+def test_strategies_skipped_for_time_are_counted(tmp_path: Path) -> None:
+    log, late = StrategyLog(tmp_path / "strategies"), Skip("in any words", for_time=True)
+    log.skipped = {"fisheye": late, "relaxed ratio test": Skip("in other words"), "more features": late}
+    assert log.skipped_for_time() == 2
+    log.add(Outcome("fisheye", "x.db"))
+    again = StrategyLog(tmp_path / "strategies")
+    assert again.skipped_for_time() == log.skipped_for_time() == 1, "not one that was tried in the end"
 
 
 @pytest.mark.parametrize(
