@@ -17,9 +17,8 @@ import numpy as np
 
 from benchmarks.record import Record, add_out
 from nerf.runtime.parallel import take_over_cores
-from pipeline.engine.display import SilentDisplay
 from pipeline.engine.workspace import Workspace
-from stages.contract import Inputs
+from stages.contract import Inputs, SilentProgress
 from stages.depth import Config
 from stages.depth.estimation import depth_maps, match_pairs
 from stages.depth.files import FOLDER
@@ -32,7 +31,7 @@ def figures(inputs: Inputs, side: int) -> dict[str, Any]:
     """One row of the table."""
     camera = read_scene(inputs["normalise"]).cameras[0]
     photos = read_training_photos(inputs, max(1.0, max(camera.width, camera.height) / side))
-    progress = SilentDisplay()
+    progress = SilentProgress()
     with tempfile.TemporaryDirectory() as name, one_thread_each():
         folder = Path(name)
         started = time.process_time()

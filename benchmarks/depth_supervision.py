@@ -26,9 +26,8 @@ from nerf.runtime.parallel import take_over_cores
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.metrics import psnr
 from nerf.training.ray_dataset import RayDataset
-from pipeline.engine.display import SilentDisplay
 from pipeline.engine.workspace import Workspace
-from stages.contract import Inputs
+from stages.contract import Inputs, SilentProgress
 from stages.effects.decisions import Decisions
 from stages.effects.image_effects import image_effects
 from stages.hardware.backend import chosen_backend
@@ -119,7 +118,7 @@ def _progress(run: dict[str, Any], step: int, elapsed: float) -> float:
 
 def datasets(inputs: Inputs, scene: Any, downscale: float) -> dict[str, RayDataset]:
     """By the arm what it is trained on."""
-    on = guided_dataset(inputs, scene, downscale, SilentDisplay(), inputs["depth"])
+    on = guided_dataset(inputs, scene, downscale, SilentProgress(), inputs["depth"])
     return {"off": on._replace(depth_maps=None), "on": on}
 
 

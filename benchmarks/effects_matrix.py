@@ -17,9 +17,8 @@ from typing import Any, NamedTuple
 
 from benchmarks.record import Record, add_out
 from nerf.runtime.parallel import take_over_cores
-from pipeline.engine.display import SilentDisplay
 from stages import effects
-from stages.contract import run_stage
+from stages.contract import SilentProgress, run_stage
 from stages.effects.decisions import Decisions, read_decisions
 from stages.effects.pilots import pilot_scene, run_pilot
 from stages.io.files import read_scene
@@ -83,13 +82,13 @@ def decide(folder: Path, made: Effects, seed: int) -> Outcome:
     """Make the photos and run the stage on them."""
     inputs, out = effect_scene(folder / "scene", made, seed), folder / "effects"
     out.mkdir()
-    run_stage(effects, effects.Config(seed=seed), inputs, out, SilentDisplay())
+    run_stage(effects, effects.Config(seed=seed), inputs, out, SilentProgress())
     return Outcome(read_decisions(out), json.loads((out / "effects.json").read_text("utf-8")), inputs, made)
 
 
 def gains(found: Outcome, wanted: Cell, steps: int) -> str:
     """What each effect that a scene calls for gains over leaving it out, in dB."""
-    trial = pilot_scene(found.inputs, read_scene(found.inputs["normalise"]), SilentDisplay())
+    trial = pilot_scene(found.inputs, read_scene(found.inputs["normalise"]), SilentProgress())
     assert not isinstance(trial, str), trial
     called_for = (wanted.on & found.on) | ({"view_dependence"} if wanted.made.highlight else set())
     tried, parts = ["exposure", "pose_refinement", "vignetting", "view_dependence"], []
@@ -97,7 +96,7 @@ def gains(found: Outcome, wanted: Cell, steps: int) -> str:
         tried.append("background")
     for name in tried:
         if name in called_for:
-            pilot = run_pilot(trial, found.decisions.without(name), found.decisions, steps, 0, SilentDisplay())
+            pilot = run_pilot(trial, found.decisions.without(name), found.decisions, steps, 0, SilentProgress())
             parts.append(f"{name} {pilot.gain_db:+.2f} ± {pilot.noise_db:.2f}, {pilot.cost:+.0%} time")
     return "; ".join(parts)
 

@@ -26,7 +26,7 @@ from nerf.runtime.parallel import take_over_cores, workers
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from nerf.training.metrics import psnr
 from nerf.training.ray_dataset import RayDataset
-from pipeline.engine.display import SilentDisplay
+from stages.contract import SilentProgress
 from stages.effects.decisions import Space
 from stages.hardware.backend import load_backend
 from stages.io.files import read_json, read_scene
@@ -173,8 +173,8 @@ def main() -> None:
     inputs = {stage: given.workspace / stage / keys[stage][:16] for stage in ("ingest", "normalise")}
     scene = read_scene(inputs["normalise"])
     data = (
-        guided_dataset(inputs, scene, 1.0, SilentDisplay()),
-        training_dataset(inputs["ingest"], scene, "test", 1.0, SilentDisplay()),
+        guided_dataset(inputs, scene, 1.0, SilentProgress()),
+        training_dataset(inputs["ingest"], scene, "test", 1.0, SilentProgress()),
     )
     dataset, test = (each.to(given.device) for each in data)
     ndc, record = enclosing_pyramid(scene), Record(given.out)

@@ -22,9 +22,8 @@ from scipy.spatial import KDTree
 from benchmarks.record import Record, add_out
 from nerf import REGION_HALF_SIZE
 from pipeline.demo.truth import Truth, compare_with_truth
-from pipeline.engine.display import SilentDisplay
 from pipeline.engine.workspace import Workspace
-from stages.contract import Inputs
+from stages.contract import Inputs, SilentProgress
 from stages.mesh import COLOURED_FACES, Config
 from stages.mesh.extraction import Source, extract_mesh, load, write_mesh
 from stages.mesh.files import ColouredMesh
@@ -53,10 +52,10 @@ def to_points(mesh: "ColouredMesh", points: np.ndarray) -> dict[str, float]:
 
 def figures(folders: Inputs, resolution: int, truth: Truth | None) -> dict[str, Any]:
     """One resolution's row of the table."""
-    source = load(folders, SilentDisplay())
+    source = load(folders, SilentProgress())
     started = time.perf_counter()
     made = extract_mesh(
-        Config(resolution=resolution, max_faces=COLOURED_FACES, texture_size=0), source, SilentDisplay()
+        Config(resolution=resolution, max_faces=COLOURED_FACES, texture_size=0), source, SilentProgress()
     )
     seconds = time.perf_counter() - started
     if truth is None:

@@ -19,10 +19,9 @@ import torch
 
 from benchmarks.record import Record, add_out
 from nerf.geometry.rays import Rays
-from pipeline.engine.display import SilentDisplay
 from pipeline.engine.workspace import Workspace
 from stages import mesh
-from stages.contract import plan_stage
+from stages.contract import SilentProgress, plan_stage
 from stages.evaluate.image_metrics import ssim
 from stages.io.files import write_png
 from stages.io.pixels import load_pixels
@@ -110,8 +109,8 @@ def meshes_of(source: Source, train: Path, resolution: int) -> dict[str, tuple[C
     made = []
     for size in (Config().texture_size, 0):
         asked = Config(resolution=resolution, texture_size=size)
-        config = plan_stage(mesh, asked, {"train": train}, SilentDisplay())
-        made.append(extract_mesh(config, source, SilentDisplay()).mesh)
+        config = plan_stage(mesh, asked, {"train": train}, SilentProgress())
+        made.append(extract_mesh(config, source, SilentProgress()).mesh)
     return {"texture": (made[0], True), "vertex": (made[0], False), "untextured": (made[1], False)}
 
 
@@ -168,7 +167,7 @@ def main() -> None:
         workspace = Workspace.existing(path)
         keys = workspace.read_run().keys
         folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train")}
-        source = load(folders, SilentDisplay())
+        source = load(folders, SilentProgress())
         pictures = None if given.pictures is None else given.pictures / path.stem
         record.add(set=path.stem, **figures(source, folders["train"], given, pictures))
 

@@ -20,10 +20,9 @@ from scipy.spatial import KDTree
 from benchmarks.mesh_scenes import SCENES, Plane, Points, SyntheticPhotos, scene_of, write_photos
 from benchmarks.record import Record, add_out
 from pipeline.cli.commands import run_command
-from pipeline.engine.display import SilentDisplay
 from pipeline.engine.workspace import Workspace
 from stages import mesh
-from stages.contract import Inputs, plan_stage
+from stages.contract import Inputs, SilentProgress, plan_stage
 from stages.mesh import Config
 from stages.mesh.extraction import Source, extract_mesh, load
 from stages.mesh.surface import Surface, face_area_vectors, sampled_faces
@@ -126,9 +125,9 @@ def row(scene: SyntheticPhotos, source: Source, config: Config, given: argparse.
     """The mesh's figures, and the seconds of a core that it took."""
     began = time.process_time()
     if given.iso_factor != 1:
-        level = extract_mesh(config.model_copy(update={"keep": "all"}), source, SilentDisplay()).iso_level.density
+        level = extract_mesh(config.model_copy(update={"keep": "all"}), source, SilentProgress()).iso_level.density
         config = config.model_copy(update={"iso_level": given.iso_factor * level})
-    made = extract_mesh(config, source, SilentDisplay()).mesh
+    made = extract_mesh(config, source, SilentProgress()).mesh
     seconds = time.process_time() - began
     surface = in_world(Surface(made.vertices, made.faces), source, given.shift * scene.size / 100)
     return compared(surface, scene) | {"cpu_seconds": round(seconds, 1)}
@@ -152,9 +151,9 @@ def main() -> None:
     for name in given.scenes:
         scene = scene_of(name, given.solids, given.width, given.photos)
         folders = trained(scene, given.folder, name, given.steps)
-        source = load(folders, SilentDisplay())
+        source = load(folders, SilentProgress())
         asked = Config(resolution=given.resolution, texture_size=0)
-        config = plan_stage(mesh, asked, folders, SilentDisplay())
+        config = plan_stage(mesh, asked, folders, SilentProgress())
         facts = {"set": name, "steps": given.steps, "width": given.width, "resolution": config.resolution}
         record.add(**facts, **row(scene, source, config, given))
 

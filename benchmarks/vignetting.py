@@ -22,7 +22,7 @@ from benchmarks.record import Record, add_out
 from nerf.effects.statistics.exposure import EV
 from nerf.effects.statistics.vignetting import log_falloff
 from nerf.runtime.parallel import take_over_cores
-from pipeline.engine.display import SilentDisplay
+from stages.contract import SilentProgress
 from stages.effects import pilots
 from stages.effects.decisions import Decisions
 from stages.effects.scene_statistics import measured_gains, measured_vignetting, observed
@@ -43,8 +43,8 @@ def figures(made: Effects, seed: int, steps: int, folder: Path) -> dict[str, Any
     """A row of the table."""
     inputs = effect_scene(folder, made, seed)
     scene, points = read_scene(inputs["normalise"]), read_tensors(inputs["normalise"] / "points.safetensors")
-    seen = observed(inputs["ingest"], scene, points, {}, SilentDisplay())
-    trial = pilots.pilot_scene(inputs, scene, SilentDisplay())
+    seen = observed(inputs["ingest"], scene, points, {}, SilentProgress())
+    trial = pilots.pilot_scene(inputs, scene, SilentProgress())
     assert not isinstance(trial, str), trial
     names = [view.name for view in scene.of_split("train")]
     gains, falloff = (dict(zip(names, of(seen).tolist(), strict=True)) for of in (measured_gains, measured_vignetting))
