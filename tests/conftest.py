@@ -1,5 +1,7 @@
 """Shared by all tests: shape checking of nerf/, and where the real photo sets are."""
 
+import functools
+import pkgutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -60,6 +62,17 @@ class SilentProgress:
         """Forget the notes."""
         self.notes.clear()
         self.codes.clear()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def rates_are_measured_once() -> Iterator[None]:
+    """The machine's rates, which every training measures at its end for half a second on all cores, and which no result
+    depends on."""
+    measure = pkgutil.resolve_name("nerf.runtime.machine_rates:measure_rates")  # here, for modules are checked by then
+    once = functools.cache(lambda device: measure(device, width=64, rows=1 << 12, seconds=0.1))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stages.train.profile.measure_rates", lambda device, *_: once(device))
+        yield
 
 
 @pytest.fixture(autouse=True)

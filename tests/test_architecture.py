@@ -60,6 +60,7 @@ BOUNDARIES = {
     "stages.hardware.": "the machine",
     "stages.io.stopwatch.": "time",
     "stages.render.renderer.": "how fast which field renders",
+    "stages.train.profile.measure_rates": "how fast the machine is",
     "pipeline.engine.runner.STAGES": "a chain of made-up stages",
 }
 MACHINE = ("time", "cores", "processors", "compute_device", "available_bytes", "available_on")  # wherever imported

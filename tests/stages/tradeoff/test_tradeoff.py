@@ -1,6 +1,7 @@
 import mmap
 import shutil
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -13,7 +14,7 @@ from PIL import Image
 
 from nerf.geometry.scene import Camera
 from stages import tradeoff, train
-from stages.contract import StageError, run_stage
+from stages.contract import StageError, StageResult, run_stage
 from stages.effects.decisions import Decisions, write_decisions
 from stages.evaluate.tiles import MIN_TILES
 from stages.io import stopwatch
@@ -25,6 +26,7 @@ from stages.train.config import WHITE, FieldName
 from stages.train.data import PhotoReader, view_rays
 from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.fields.vanilla_options import VanillaOptions
+from tests.conftest import SilentProgress
 from tests.refusals import refused
 from tests.stages.photo_scene import photographed
 
@@ -33,7 +35,8 @@ TINY: dict[FieldName, dict[str, Any]] = {
     "vanilla": {"depth": 2, "width": 16, "samples_coarse": 8, "samples_fine": 8, "batch_rays": 64},
 }
 TINY_GRID = HashGridOptions(**TINY["grid"])
-SPEEDS: dict[str, Any] = dict.fromkeys(schedule.TIMED, (200.0, 1e7))
+MIN_STEPS = 8  # of runs, instead of 30: they need only differ
+SPEEDS: dict[str, Any] = dict.fromkeys(schedule.TIMED, (40.0, 1e7))
 SPEEDS |= dict.fromkeys((PUBLISHED, FEWER_RAYS), (0.1, 10.0))
 CONFIG: dict[str, Any] = {
     "seconds": 14.0,
@@ -45,17 +48,21 @@ CONFIG: dict[str, Any] = {
 }
 
 
-@pytest.fixture(autouse=True)
-def tiny_fields(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module", autouse=True)
+def tiny_fields() -> Iterator[None]:
     """The variants as they are, in sizes that train in a blink; few of them, none left out for a busy machine."""
-    for name, variant in VARIANTS.items():
-        field = schedule.field_name(name)
-        sizes = {field: {**variant.options.get(field, {}), **TINY[field]}}
-        kept = {key: value for key, value in variant.options.items() if key != "preset"}
-        monkeypatch.setitem(VARIANTS, name, variant._replace(options=kept | sizes, grid_size=None))
-    monkeypatch.setattr(schedule, "WALL_TIME_RATIO", 1.0)
-    monkeypatch.setattr(schedule, "OTHER_TIME", 0.6)
-    monkeypatch.setattr(study, "MAX_LATE", 1e3)
+    with pytest.MonkeyPatch.context() as patch:
+        for name, variant in VARIANTS.items():
+            field = schedule.field_name(name)
+            sizes = {field: {**variant.options.get(field, {}), **TINY[field]}}
+            kept = {key: value for key, value in variant.options.items() if key != "preset"}
+            least = MIN_STEPS if variant.min_steps == schedule.MIN_STEPS else variant.min_steps
+            tiny = variant._replace(options=kept | sizes, grid_size=None, min_steps=least)
+            patch.setitem(VARIANTS, name, tiny)
+        patch.setattr(schedule, "WALL_TIME_RATIO", 1.0)
+        patch.setattr(schedule, "OTHER_TIME", 0.6)
+        patch.setattr(study, "MAX_LATE", 1e3)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -68,18 +75,23 @@ def studied(folder: Path, photos: dict[str, Path], progress: Any, **settings: An
     return tradeoff.run(Config.model_validate(CONFIG | {"speeds": SPEEDS} | settings), photos, folder, progress)
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, photos: dict[str, Path]) -> tuple[Path, StageResult]:
+    """A study that nobody disturbed, and its folder. Do not write into it."""
+    folder = tmp_path_factory.mktemp("studied")
+    return folder, studied(folder, photos, SilentProgress())
+
+
 class Killed(BaseException):
     """Stands for kill -9."""
 
 
-def test_a_study_is_the_same_after_a_kill(
-    tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    result = studied(tmp_path / "whole", photos, progress)
+def test_a_study_says_what_it_found(whole: tuple[Path, StageResult], photos: dict[str, Path]) -> None:
+    folder, result = whole
     files = {*result.outputs, *result.records}
     assert {"quality.json", "ablation.png", "tradeoff.json", "tradeoff.md", "tradeoff.svg", "tradeoff.png"} == files
-    assert all((tmp_path / "whole" / name).stat().st_size > 0 for name in files)
-    content = read_json(tmp_path / "whole" / "tradeoff.json")
+    assert all((folder / name).stat().st_size > 0 for name in files)
+    content = read_json(folder / "tradeoff.json")
     assert {row["variant"] for row in content["points"]} >= {"grid", "vanilla, reduced", "no positional encoding"}
     assert any(row["seeds"] == 2 and row["psnr_std"] > 0 for row in content["points"])
     for row in content["points"]:
@@ -87,24 +99,32 @@ def test_a_study_is_the_same_after_a_kill(
         assert 0.001 < row["model_mb"] < 10 and 50 < row["peak_memory_mb"] < 100_000
     assert "vanilla, published at full resolution: 1 steps (fewer than 300)" in content["left_out"]
     assert content["points"][content["recommended"] - 1]["pareto_front"]
-    assert content["recommendation"] in (tmp_path / "whole" / "tradeoff.md").read_text()
+    assert content["recommendation"] in (folder / "tradeoff.md").read_text()
     assert result.line.endswith(f"{content['recommendation']} Train it: {content['command']}")
     assert content["command"].startswith(f"pipeline train {photos['normalise'].parents[1].name} --train.seconds ")
     assert sum(row["fastest_to_render"] for row in content["points"] if row["pareto_front"]) == 1
     assert content["ablation"].startswith("Against the complete reduced method, seed by seed, of 2 seeds")
-    text = (tmp_path / "whole" / "tradeoff.md").read_text()
+    text = (folder / "tradeoff.md").read_text()
     assert content["ablation"] in text and "renders fastest" in text
     assert f"Train it: `{content['command']}`" in text and f"Fields: {content['descriptions']}." in text
     assert "grid: 2 grids of features, the finest of 32³ cells; " in content["descriptions"]
 
-    count, begun = len(content["runs"]), []
-    whole = benchmark.score
+
+def test_a_study_is_the_same_after_a_kill(
+    tmp_path: Path,
+    photos: dict[str, Path],
+    progress: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    whole: tuple[Path, StageResult],
+) -> None:
+    count, begun = len(read_json(whole[0] / "tradeoff.json")["runs"]), []
+    score = benchmark.score
 
     def killed_at_the_fourth(field: Path, *rest: Any) -> dict[str, Any]:
         begun.append(field.name)
         if len(begun) == 4:
             raise Killed
-        return whole(field, *rest)
+        return score(field, *rest)
 
     monkeypatch.setattr(benchmark, "score", killed_at_the_fourth)
     with pytest.raises(Killed):
@@ -113,7 +133,7 @@ def test_a_study_is_the_same_after_a_kill(
     assert len(begun) == count + 1, "each run once, and the killed one again"
     assert begun[3] == begun[4] and len(set(begun)) == count
     for name in ("quality.json", "ablation.png"):
-        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+        assert (tmp_path / "killed" / name).read_bytes() == (whole[0] / name).read_bytes()
 
 
 def test_what_is_planned_is_what_is_run(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
@@ -211,21 +231,23 @@ def test_a_study_out_of_time_still_has_a_result(
     assert len(read_json(tmp_path / "tradeoff.json")["runs"]) == 1
 
 
-def test_the_workspaces_field_is_a_point_without_output(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
+def test_the_workspaces_field_is_a_point_without_output(
+    tmp_path: Path, photos: dict[str, Path], progress: Any, whole: tuple[Path, StageResult]
+) -> None:
     own = tmp_path / "train" / "0123456789abcdef"
     own.mkdir(parents=True)
-    facts = run_stage(train, train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, own, progress).facts
+    facts = run_stage(train, train.Config(steps=20, downscale=1.0, grid=TINY_GRID), photos, own, progress).facts
     write_json(own / "manifest.json", {"facts": facts})
     with_own = studied(tmp_path / "own", photos | {"train": own}, progress)
-    without = studied(tmp_path / "none", photos, progress)
+    folder, without = whole
     assert with_own.outputs == without.outputs
     for name in with_own.outputs:
-        assert (tmp_path / "own" / name).read_bytes() == (tmp_path / "none" / name).read_bytes()
+        assert (tmp_path / "own" / name).read_bytes() == (folder / name).read_bytes()
     points = {row["variant"]: row for row in read_json(tmp_path / "own" / "tradeoff.json")["points"]}
-    assert (points[WORKSPACE_FIELD]["train_seconds"], points[WORKSPACE_FIELD]["steps"]) == (facts["train_seconds"], 70)
+    assert (points[WORKSPACE_FIELD]["train_seconds"], points[WORKSPACE_FIELD]["steps"]) == (facts["train_seconds"], 20)
     assert 5 < points[WORKSPACE_FIELD]["psnr"] < 60 and points[WORKSPACE_FIELD]["peak_memory_mb"] is None
     assert read_json(tmp_path / "own" / "tradeoff.json")["workspace_field"]["train"] == own.name
-    assert WORKSPACE_FIELD not in {row["variant"] for row in read_json(tmp_path / "none" / "tradeoff.json")["points"]}
+    assert WORKSPACE_FIELD not in {row["variant"] for row in read_json(folder / "tradeoff.json")["points"]}
     text = (tmp_path / "own" / "tradeoff.md").read_text()
     assert "This workspace's field (" in text and "this workspace's field ★ |" in text
 
@@ -235,7 +257,7 @@ def test_the_workspaces_slow_field_is_scored_on_some_pixels(
 ) -> None:
     own, kind = tmp_path / "train" / "0123456789abcdef", VanillaOptions(**TINY["vanilla"])
     own.mkdir(parents=True)
-    facts = run_stage(train, train.Config(steps=70, downscale=1.0, vanilla=kind), photos, own, progress).facts
+    facts = run_stage(train, train.Config(steps=20, downscale=1.0, vanilla=kind), photos, own, progress).facts
     write_json(own / "manifest.json", {"facts": facts})
     crops = benchmark.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
     assert 0 < benchmark.rendering_seconds(own, crops) < 10
@@ -256,7 +278,7 @@ def test_the_workspaces_slow_field_is_scored_on_some_pixels(
 
 def test_a_slow_field_is_scored_on_the_same_crops(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
     scene = read_scene(photos["normalise"])
-    run_stage(train, train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, tmp_path, progress)
+    run_stage(train, train.Config(steps=20, downscale=1.0, grid=TINY_GRID), photos, tmp_path, progress)
     crops = benchmark.make_benchmark(photos["ingest"], scene, 1.0, 4, 1.0)
     whole, thinned = (benchmark.score(tmp_path, crops, progress, stride) for stride in (1, 4))
     assert whole["ssim"] is not None and thinned["ssim"] is None
@@ -266,7 +288,7 @@ def test_a_slow_field_is_scored_on_the_same_crops(tmp_path: Path, photos: dict[s
 def test_fields_are_scored_over_the_photos_background(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
     white, black = tmp_path / "white", tmp_path / "black"
     white.mkdir()
-    run_stage(train, train.Config(steps=70, downscale=1.0, grid=TINY_GRID), photos, white, progress)
+    run_stage(train, train.Config(steps=20, downscale=1.0, grid=TINY_GRID), photos, white, progress)
     shutil.copytree(white, black)
     field = read_json(white / "field.json")
     write_json(black / "field.json", field | {"background": [0.0, 0.0, 0.0]})
@@ -339,7 +361,7 @@ def test_without_held_out_photos_there_is_no_study(tmp_path: Path, photos: dict[
 
 
 def test_too_little_time_is_said_with_numbers(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
-    with refused("tradeoff.no-result", "2 s", "grid at full resolution", "20, 12, 7, 4"):
+    with refused("tradeoff.no-result", "2 s", "grid at full resolution", "4, 2, 1"):
         studied(tmp_path, photos, progress, seconds=2.0)
 
 
