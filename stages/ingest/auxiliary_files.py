@@ -4,6 +4,7 @@ depth maps by their values, too."""
 import os
 import re
 import unicodedata
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -83,22 +84,27 @@ def pair_masks(names: Sequence[str], masks: Sequence[tuple[str, Path]]) -> tuple
     once though it may stand for several names.
 
     A photo's mask is called after it, with its ending or without, and ends as images do, in .png rather than in another
-    way. Where no other mask is called so, its accents may be composed in another way, and it may say that it is a mask:
-    a_mask.png, mask_a.png.
+    way. Where no other mask is called so, its accents may be composed in another way, it may say that it is a mask, as
+    a_mask.png, mask_a.png and dynamic_mask_a.png do, and its letters may be small or capital.
     """
     by_name: dict[str, Path] = {}
     composed: dict[str, set[Path]] = {}
     marked: dict[str, set[Path]] = {}
+    folded: dict[str, set[Path]] = {}
     for name, file in sorted(masks, key=lambda mask: not mask[0].lower().endswith(".png")):
         of, ending = os.path.splitext(name)
         if ending.lower() in IMAGES:
             by_name.setdefault(of, file)
             composed.setdefault(unicodedata.normalize("NFC", of), set()).add(file)
             marked.setdefault(unicodedata.normalize("NFC", _unmarked(of)), set()).add(file)
+            folded.setdefault(_folded(_unmarked(of)), set()).add(file)
+    photos = Counter(spelling for name in names for spelling in {_folded(name), _folded(os.path.splitext(name)[0])})
 
     def mask_of(name: str) -> Path | None:
         key = unicodedata.normalize("NFC", name)
-        alike = composed.get(key) or marked.get(key, set())
+        alike = composed.get(key) or marked.get(key)
+        if alike is None:
+            alike = folded.get(_folded(name), set()) if photos[_folded(name)] == 1 else set()
         return by_name.get(name, next(iter(alike)) if len(alike) == 1 else None)
 
     found: dict[str, Path] = {}
@@ -114,7 +120,11 @@ def pair_masks(names: Sequence[str], masks: Sequence[tuple[str, Path]]) -> tuple
 def _unmarked(name: str) -> str:
     """A mask's name without what says that it is one."""
     folder, _, last = name.rpartition("/")
-    return f"{folder}/{_MARK.sub('', last)}".removeprefix("/")
+    return f"{folder}/{_MARK.sub('', last.removeprefix(IGNORED))}".removeprefix("/")
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def is_mask(name: str) -> bool:
@@ -139,7 +149,7 @@ def _keys(file: PurePosixPath, beside: Mapping[PurePosixPath, Sequence[PurePosix
     ending = _ENDING.fullmatch(file.stem)
     if ending and ending[2].lower() == "normal" and _is_jpeg(file):
         ending = None
-    stems = [_plain(ending[1])] if ending else []
+    stems = [_plain(_without_image_ending(ending[1]))] if ending else []  # a.jpg.mask.png is one of a.jpg, too
     yield from ((file.parent, stem) for stem in stems)
     stems.append(_plain(file.stem))
     for holder in file.parents:
@@ -147,6 +157,11 @@ def _keys(file: PurePosixPath, beside: Mapping[PurePosixPath, Sequence[PurePosix
             inside = file.parent.relative_to(holder)
             folders = (*beside.get(holder.parent, ()), holder.parent)
             yield from ((folder / inside, stem) for folder in folders for stem in stems)
+
+
+def _without_image_ending(name: str) -> str:
+    stem, ending = os.path.splitext(name)
+    return stem if ending.lower() in IMAGES else name
 
 
 def _plain(stem: str) -> str:

@@ -24,6 +24,7 @@ from stages.ingest.exif import (
 )
 from stages.ingest.listing import RAW_EXTENSIONS
 from stages.ingest.panoramas import is_panorama
+from stages.io.files import stand_in
 from stages.io.pixels import pillow
 
 MAX_PIXELS = 250_000_000
@@ -160,6 +161,8 @@ def _unrecognised(path: Path) -> DecodeError:
         head = file.read(256)
     if not head:
         return DecodeError("ingest.empty-file", "the file is empty")
+    if why := stand_in(head):
+        return DecodeError("ingest.stand-in", why)
     if head.startswith((b"\xff\xd8", b"\x89PNG")):
         return _damaged("damaged: its header cannot be read")
     is_text = all(byte in b"\t\r\n" or 32 <= byte < 127 for byte in head)

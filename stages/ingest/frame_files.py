@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from stages.contract import StageError, listed
-from stages.ingest.listing import IMAGES, walk_photos
+from stages.ingest.listing import IMAGES, files_below, walk_photos
 from stages.io.transforms_files import MAX_LETTERS, photo_names
 
 MAX_NAMES = 2  # in an error
@@ -36,7 +36,7 @@ class FrameFiles:
     other_endings: dict[str, Path] = field(default_factory=dict, init=False)
     _photos: dict[tuple[str, ...], Path] = field(default_factory=dict, init=False)
     _listed: dict[Path, dict[_Spelling, list[str]]] = field(default_factory=dict, init=False)
-    _by_last: dict[str, list[Path]] = field(default_factory=dict, init=False)
+    _by_last: dict[str, dict[str, list[Path]]] = field(default_factory=dict, init=False)
 
     def photo(self, frame: dict[str, Any]) -> Path:
         """The photo of a frame: in a file of ours by its own name first, then by ``file_path``.
@@ -64,7 +64,7 @@ class FrameFiles:
         return self._file(inside, self.folders[:1], "photo") if is_reduction else None
 
     def mask(self, name: str) -> Path:
-        """The mask of this name, found as photos are."""
+        """The mask of this name, found as photos are, whose ending is its own and which is none of them."""
         return self._file(name, self.folders, "mask")
 
     def _file(self, name: str, folders: tuple[Path, ...], what: str) -> Path:
@@ -94,22 +94,38 @@ class FrameFiles:
         """The file in the first folder whose path has the longest end in common with ``name``, whatever its letters'
         case, and its ending where no other file is called so; None where there is no such file. Raises StageError where
         there are several."""
-        root = self.folders[0]
-        if not self._by_last:
-            for file in walk_photos(root):
-                for spelling in (file.name, file.stem) if file.suffix.lower() in IMAGES else (file.name,):
-                    self._by_last.setdefault(_folded(spelling), []).append(file)
+        root, by_last = self.folders[0], self._lasts(what)
         *above, last = [_folded(part) for part in PurePosixPath(_as_paths(name)[-1]).parts] or [""]
         stem, ending = os.path.splitext(last)
-        found = self._by_last.get(last) or (self._by_last.get(stem, []) if ending in IMAGES else [])
+        found = by_last.get(last) or (by_last.get(stem, []) if ending in IMAGES else [])
+        if what == "mask":
+            photos = set(self._photos.values())
+            found = [file for file in found if file not in photos]
         found = [file for file in found if self.follows_links or file.resolve().is_relative_to(root.resolve())]
         alike = [_in_common(above, [_folded(part) for part in file.parent.parts]) for file in found]
         best = [file for file, count in zip(found, alike, strict=True) if count == max(alike)]
         if len(best) > 1:
             raise _ambiguous(name, what, root, best)
-        if best and ending in IMAGES and ending != best[0].suffix.lower():
+        if what == "photo" and best and ending in IMAGES and ending != best[0].suffix.lower():
             self.other_endings[name] = best[0]
         return best[0] if best else None
+
+    def _lasts(self, what: str) -> dict[str, list[Path]]:
+        """The files of the first folder by the last part of their paths, an image's without its ending, too. Masks
+        lie in folders in which no photo is looked for."""
+        if what not in self._by_last:
+            by_last = self._by_last.setdefault(what, {})
+            for file in walk_photos(self.folders[0]) if what == "photo" else self._walk_masks():
+                for spelling in (file.name, file.stem) if file.suffix.lower() in IMAGES else (file.name,):
+                    by_last.setdefault(_folded(spelling), []).append(file)
+        return self._by_last[what]
+
+    def _walk_masks(self) -> Iterator[Path]:
+        """What may be a mask: all in the first folder, and in folders of masks in the others."""
+        others = set(self.folders[1:]) - {self.folders[0]}
+        beside = (child for folder in sorted(others) for child in sorted(folder.glob("*/")))
+        for place in (self.folders[0], *(child for child in beside if child.name.lower().startswith("mask"))):
+            yield from files_below(place, lambda folder: not folder.name.startswith("."))
 
     def _inside(self, folder: Path, file_path: str, what: str) -> Path:
         """The file of this name in ``folder``. Raises StageError where it leads out of there, but for a link to the
@@ -154,7 +170,7 @@ class FrameFiles:
 
 
 def _ambiguous(name: str, what: str, root: Path, found: Sequence[Path]) -> StageError:
-    names = sorted(file.relative_to(root).as_posix() for file in found)
+    names = sorted(Path(os.path.relpath(file, root)).as_posix() for file in found)
     return StageError(
         "ingest.ambiguous-path",
         f"cannot tell which {what} {name[:MAX_LETTERS]!r} is",
@@ -164,12 +180,13 @@ def _ambiguous(name: str, what: str, root: Path, found: Sequence[Path]) -> Stage
 
 
 def _as_paths(name: str) -> tuple[str, ...]:
-    """``name`` as it stands, with the slashes of Windows turned, and as the URL that it may be."""
+    """``name`` as it stands, with the slashes of Windows turned, and as the URL that it may be, without blanks or line
+    ends around it."""
     if name.startswith("file://"):
-        return (_decoded(name.removeprefix("file://")),)
+        return (_decoded(name.removeprefix("file://")).strip(),)
     turned = name.replace("\\", "/")
     path = re.split("[?#]", turned)[0] if "://" in turned else turned
-    return name, turned, _decoded(path)
+    return name, turned, _decoded(path).strip()
 
 
 def _decoded(url: str) -> str:

@@ -27,6 +27,8 @@ RAW_EXTENSIONS = (
 )
 # fmt: on
 MASKS = "masks"  # the folder of masks, whatever its letters' case
+# Thumbnails, deleted files and attributes of Synology, QNAP, Windows and macOS, in small letters.
+_OF_SYSTEMS = ("@eadir", "#recycle", "@recycle", "@__thumb", "$recycle.bin", "system volume information", "__macosx")
 MAX_OTHER_FILES = 2  # files beside a video, too few to be a set of photos
 FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
 _LINKS_HINT = "Fetch them (git annex get, dvc pull), or connect the drive that holds them."
@@ -36,13 +38,14 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     """All files below ``root`` that may be photos, sorted by relative name; the video where there is a single one and
     beside it no more than MAX_OTHER_FILES of these, none an image by its ending.
 
-    Skipped: hidden files, ``masks`` folders, workspaces of ours (folders with a run.json), and files whose
-    extension says that they are no images. Folders that are symbolic links are not followed.
+    Skipped: hidden files, ``masks`` folders, thumbnails and deleted files that systems keep, workspaces of ours
+    (folders with a run.json), and files whose extension says that they are no images. Folders that are symbolic links
+    are not followed.
     Raises StageError if nothing remains and PermissionError for a folder that cannot be read.
     """
     found = files_below(root, is_photo_folder)
     if not found:
-        raise StageError("ingest.empty-folder", f"{root} is empty", "it holds no file", FOLDER_HINT)
+        raise _empty(root)
     photos, videos = [file for file in found if may_be_photo(file)], without_previews(found)
     unknown = not any(file.suffix.lower() in IMAGES + RAW_EXTENSIONS for file in photos)
     if len(videos) == 1 and unknown and len(photos) <= MAX_OTHER_FILES:
@@ -87,8 +90,10 @@ def _is_lost(file: Path) -> bool:
 
 
 def is_photo_folder(folder: Path) -> bool:
-    """Whether photos are looked for in a folder: it is not hidden, holds no masks, and is no workspace of ours."""
-    return not folder.name.startswith(".") and folder.name.lower() != MASKS and not (folder / "run.json").is_file()
+    """Whether photos are looked for in a folder: it is not hidden, holds no masks, is none that systems keep, and no
+    workspace of ours."""
+    name = folder.name.lower()
+    return not name.startswith(".") and name not in (MASKS, *_OF_SYSTEMS) and not (folder / "run.json").is_file()
 
 
 def may_be_photo(file: Path) -> bool:
@@ -105,6 +110,15 @@ def without_previews(found: list[Path]) -> list[Path]:
     """The videos; previews of videos only where there is nothing else."""
     videos = [file for file in found if is_video(file)]
     return [file for file in videos if file.suffix.lower() not in _PREVIEWS] or videos
+
+
+def _empty(root: Path) -> StageError:
+    """The error for a folder without any file that is looked at."""
+    why, hint = "it holds no file", FOLDER_HINT
+    if link := next((one for one in sorted(root.iterdir()) if one.is_symlink() and one.is_dir()), None):
+        why = f"it holds no file, and {link.name} is a link to a folder, which is not followed"
+        hint = f"Give that folder: pipeline run {link.resolve()}"
+    return StageError("ingest.empty-folder", f"{root} is empty", why, hint)
 
 
 def _no_photos(root: Path, found: list[Path], videos: list[Path]) -> StageError:

@@ -66,8 +66,8 @@ def read_mask(file: Path, width: int, height: int, orientation: int, stored: boo
     except DecodeError as error:
         raise DecodeError("ingest.mask-unusable", f"its mask {file.name} cannot be used: {error}") from error
     light, grey = _light(decoded, file)
-    if marks_ignored(file.name):  # all that is not black, as instant-ngp has it
-        light = np.where(light > 0, np.uint8(0), np.uint8(255))
+    if marks_ignored(file.name):  # all that is not black, as instant-ngp has it, but for what losses leave of black
+        light = np.where(light >= (USE_FROM if decoded.lossy else 1), np.uint8(0), np.uint8(255))
     pixels = np.where(light >= USE_FROM, np.uint8(255), np.uint8(0))
     size, found = (width, height), (pixels.shape[1], pixels.shape[0])
     fits, fits_stored = _same_shape(found, size), _same_shape(found, _stored(size, orientation))

@@ -15,6 +15,7 @@ from stages.ingest.sources import (
     Source,
     mask_beside,
     photos_beside,
+    photos_without_frame,
     reduced_folders,
     unused_cameras,
     unused_masks,
@@ -78,6 +79,10 @@ def note_unused(source: Source, photos: Path, progress: Progress) -> None:
         which = listed([f"{folder.name}/" for folder in copies], 3)
         what = f"the photos of {source.root.name}/ are used, and not their smaller copies in {which}"
         progress.note("ingest.smaller-copies", f"{what}; to use those, give the folder itself")
+    if unnamed := photos_without_frame(source):
+        lie, which = _photos_are(len(unnamed)), _first_names(unnamed)
+        file = source.cameras.name if source.cameras else ""
+        progress.note("ingest.photos-without-frame", f"{lie} left out, because {file} does not name them: {which}")
     if others := source.other_endings:
         which = listed([f"{shown(photo)} ({shown(path)})" for path, photo in others.items()], 3)
         words = f"{len(others)} frames use photos of the same name with another file ending: {which}"
@@ -241,12 +246,11 @@ def too_few(source: Source, names: Sequence[str], rejected: Sequence[Rejection])
     """The error for one photo or none, ``names``, and what the rejections show."""
     if not names:
         first = f"{shown(rejected[0].name)}: {rejected[0].reason}"
-        of_masks = all(one.code.startswith(OF_MASK) for one in rejected)
         return StageError(
             "ingest.no-usable-photo",
             f"none of the {len(rejected)} files in {source.root} is a usable photo",
             first,
-            "Correct the masks (black is ignored, white is used), or remove them." if of_masks else HINT,
+            _what_to_do(rejected),
         )
     only = shown(names[0])
     if rejected and all(rejection.code == IDENTICAL for rejection in rejected):
@@ -266,6 +270,18 @@ def too_few(source: Source, names: Sequence[str], rejected: Sequence[Rejection])
     return StageError(
         "ingest.one-photo", "there is only one photo", f"a scene needs at least two, and there is only {only}", HINT
     )
+
+
+def _what_to_do(rejected: Sequence[Rejection]) -> str:
+    """What helps where all files are rejected: what helps all of them, else better photos."""
+    codes = {one.code for one in rejected}
+    if all(code.startswith(OF_MASK) for code in codes):
+        return "Correct the masks (black is ignored, white is used), or remove them."
+    if codes <= {"ingest.stand-in", "ingest.empty-file", "ingest.damaged-file"}:
+        return "Copy or download the photos again."
+    if codes <= {"ingest.not-an-image", "ingest.raw-file", "ingest.pixel-format", "ingest.pixel-range"}:
+        return "Export them as JPEG, PNG or TIFF, with 8 or 16 bits per value."
+    return HINT
 
 
 def all_the_same(photos: int) -> StageError:

@@ -26,6 +26,7 @@ from stages.ingest.listing import (
     may_be_photo,
     walk_photos,
 )
+from stages.io.files import part_file
 from stages.io.transforms_files import HELD_OUT, TRAIN, photo_names, read_splits
 
 SourceKind = Literal["photos", "video", "transforms", "blender", "colmap", "llff"]
@@ -50,7 +51,9 @@ OTHER_CAMERAS = {
     ".npz": ("a NumPy archive", ""),
 }
 _REDUCED = re.compile(r"images_(\d+)")
-_OF_MASKS = re.compile(r"masks?([._-].*)?", re.IGNORECASE)
+_OF_MASKS = re.compile(
+    r"(.+[._-])?masks?([._-].*)?|seg(mentation|mentations|s)?|silhouettes?|mattes?|alphas?", re.IGNORECASE
+)
 _HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
 
 
@@ -195,6 +198,22 @@ def unused_masks(source: Source) -> Path | None:
         if pair_masks(names, [(_name(folder, file), file) for file in inside])[0]:
             return folder
     return None
+
+
+def photos_without_frame(source: Source) -> list[str]:
+    """Photos that a transforms file does not name, in the folders of those that it names."""
+    if source.kind != "transforms":
+        return []
+    named = {source.name(file) for file in source.files}
+    inside = {
+        child for folder in {file.parent for file in source.files} if folder.is_dir() for child in folder.iterdir()
+    }
+    shown = (one for one in inside if one.suffix.lower() in IMAGES and not one.name.startswith(".") and one.is_file())
+    there = sorted(named | {source.name(file) for file in shown if file.is_relative_to(source.root)})
+    others = [name for name in there if name not in named and not is_mask(name)]
+    auxiliary = auxiliary_files(there)
+    masks = {source.name(file) for _, file in source.masks if file.is_relative_to(source.root)}
+    return [name for name in others if name not in auxiliary and name not in masks]
 
 
 def photos_beside(source: Source, photos: Path) -> int:
@@ -462,7 +481,9 @@ def _cameras_of(model: Path, photos: Sequence[str]) -> int:
 
 def _model_files(folder: Path) -> tuple[Path, ...]:
     for extension in (".bin", ".txt"):
-        cameras, images, points = (folder / f"{part}{extension}" for part in ("cameras", "images", "points3D"))
+        cameras, images, points = (
+            part_file(folder, f"{part}{extension}") for part in ("cameras", "images", "points3D")
+        )
         if cameras.is_file() and images.is_file():
             return (cameras, images, points) if points.is_file() else (cameras, images)
     return ()

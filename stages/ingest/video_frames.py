@@ -24,7 +24,7 @@ from stages.ingest.optical_flow import corners, follow_both_ways
 from stages.ingest.panoramas import cutting_advice, is_panorama
 from stages.ingest.sharpness import WIDTH, at_most, sharpness
 from stages.io.ascii_names import shell_quoted
-from stages.io.files import write_jpeg
+from stages.io.files import stand_in, write_jpeg
 
 FLOW_WIDTH = 500  # pixels of the frames on which motion is measured
 MAX_CORNERS, MIN_CORNERS = 150, 10
@@ -311,7 +311,7 @@ def _opened(video: Path) -> Iterator[cv2.VideoCapture]:
     cv2.utils.logging.setLogLevel(before)
     try:
         if not capture.isOpened():
-            raise _undecodable("ingest.unknown-video", video, "it is damaged or of an unknown format")
+            raise _unknown(video)
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         yield capture
     finally:
@@ -333,6 +333,15 @@ def _with_square_pixels(frame: np.ndarray, stretch: tuple[float, float]) -> np.n
         return frame
     height, width = frame.shape[:2]
     return cv2.resize(frame, (round(width * stretch[0]), round(height * stretch[1])), interpolation=cv2.INTER_CUBIC)
+
+
+def _unknown(video: Path) -> StageError:
+    with video.open("rb") as file:
+        why = stand_in(file.read(256))
+    if why is None:
+        why = "it is cut off or damaged, has sound and no pictures, or is of an unknown format"
+        return _undecodable("ingest.unknown-video", video, why)
+    return StageError("ingest.no-video", f"cannot decode the video {video.name}", why, "Copy or download it again.")
 
 
 def _undecodable(code: str, video: Path, why: str) -> StageError:

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nerf.geometry.scene import Camera
+from stages.io.files import part_file, stand_in
 
 # By COLMAP's number: the name and how many parameters it has.
 CAMERA_MODELS = {
@@ -85,7 +86,7 @@ def read_model_files(folder: Path) -> ModelFiles:
         if binary
         else {"cameras": _text_cameras, "images": _text_images, "points3D": _text_points}
     )
-    files = {part: folder / f"{part}{'.bin' if binary else '.txt'}" for part in readers}
+    files = {part: part_file(folder, f"{part}{'.bin' if binary else '.txt'}") for part in readers}
     if not files["points3D"].is_file():
         readers["points3D"] = lambda _: iter(())
     parts = []
@@ -93,7 +94,9 @@ def read_model_files(folder: Path) -> ModelFiles:
         try:
             parts.append(_by_id(readers[part](path)))
         except (struct.error, ValueError, OverflowError) as error:
-            raise ValueError(f"{path.name} is damaged: {error}") from error
+            with path.open("rb") as file:
+                why = stand_in(file.read(200))
+            raise ValueError(f"{path.name}: {why}" if why else f"{path.name} is damaged: {error}") from error
     model = ModelFiles(*parts)
     if not model.points:  # what images see are then points that nobody knows
         images = {i: image._replace(points=np.full_like(image.points, NO_POINT)) for i, image in model.images.items()}
@@ -104,7 +107,8 @@ def read_model_files(folder: Path) -> ModelFiles:
 
 def image_names(folder: Path) -> list[str]:
     """The names of the images of the model in ``folder``; none where its file of images is damaged."""
-    images = _binary_images(folder / "images.bin") if _is_binary(folder) else _text_images(folder / "images.txt")
+    reader, name = (_binary_images, "images.bin") if _is_binary(folder) else (_text_images, "images.txt")
+    images = reader(part_file(folder, name))
     try:
         return [image.name for _, image in images]
     except (OSError, struct.error, ValueError, OverflowError):
@@ -113,7 +117,9 @@ def image_names(folder: Path) -> list[str]:
 
 def _is_binary(folder: Path) -> bool:
     """Whether the model's binary files count, of which one alone does not stand in for text that is complete."""
-    binary, text = ([(folder / f"{part}{end}").is_file() for part in ("cameras", "images")] for end in (".bin", ".txt"))
+    binary, text = (
+        [part_file(folder, f"{part}{end}").is_file() for part in ("cameras", "images")] for end in (".bin", ".txt")
+    )
     return all(binary) or (any(binary) and not all(text))
 
 
@@ -168,8 +174,11 @@ class _Bytes:
 
     def take(self, form: str) -> tuple:
         """The next numbers of this struct format."""
+        end = self.place + struct.calcsize(f"<{form}")
+        if end > len(self.data):
+            raise ValueError(f"it ends after {len(self.data)} bytes, inside an entry")
         values = struct.unpack_from(f"<{form}", self.data, self.place)
-        self.place += struct.calcsize(f"<{form}")
+        self.place = end
         return values
 
     def skip(self, count: int, size: int) -> memoryview:

@@ -41,6 +41,27 @@ def read_json(path: Path) -> Any:
         raise damaged("io.damaged-json", path.name, str(error)) from error
 
 
+def part_file(folder: Path, name: str) -> Path:
+    """The file of this name in a folder, or where there is none the only one whose name differs in capitals alone, as
+    programs on Windows need not care."""
+    if (file := folder / name).is_file() or not folder.is_dir():
+        return file
+    alike = [one for one in folder.iterdir() if one.name.lower() == name.lower() and one.is_file()]
+    return alike[0] if len(alike) == 1 else file
+
+
+def stand_in(data: bytes) -> str | None:
+    """Words for a file of which this is the beginning and that is not what its name says, but stands in for it; None
+    for all others."""
+    if not data:
+        return "the file is empty"
+    if data.startswith(b"version https://git-lfs"):
+        return "it is a pointer of Git LFS and not the file itself; fetch it with git lfs pull"
+    if data.lstrip()[:15].lower().startswith((b"<!doctype html", b"<html")):
+        return "it is a web page and not the file itself; download it again"
+    return None
+
+
 def damaged(code: str, name: str, why: str) -> StageError:
     """The error for a file that one of our stages wrote and that is not any more as it was."""
     return StageError(code, f"cannot read {name}", why, "Delete its folder and run again.")

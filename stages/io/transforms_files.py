@@ -6,6 +6,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from stages.contract import Note, StageError, listed
+from stages.io.files import stand_in
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,6 +21,10 @@ _FRAME_HINT = (
     "Rename its keys, or convert it: file_path is the file of a photo; transform_matrix is 4 × 4, world from camera, "
     "with camera axes x right, y up, z back."
 )
+_JSON_HINT = (
+    "Correct it there, or export it again: JSON has no comments, no comma after the last entry, no single quotes, and "
+    "one value in a file."
+)
 _HINT = "Give a transforms.json as nerfstudio, instant-ngp or the NeRF-synthetic scenes write it."
 
 
@@ -27,19 +32,37 @@ def read_transforms(transforms: Path, *, may_be_empty: bool = False) -> dict[str
     """The content of a transforms file, checked to hold a list ``frames`` of objects with ``file_path`` and
     ``transform_matrix``. Raises StageError otherwise."""
     what = f"cannot use {transforms.name}"
+    data = transforms.read_bytes()
     try:
-        content = json.loads(transforms.read_bytes())  # UTF-8, 16 or 32, with a byte order mark or without
+        content = json.loads(data)  # UTF-8, 16 or 32, with a byte order mark or without
     except (ValueError, RecursionError) as error:
-        raise StageError(
-            "io.transforms-not-json", f"cannot read {transforms.name}", f"it is not JSON ({error})", _HINT
-        ) from error
+        why, hint = _why_no_json(data, error)
+        raise StageError("io.transforms-not-json", f"cannot read {transforms.name}", why, hint) from error
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
-        has = f": it has {_keys(content)}" if isinstance(content, dict) else ""
-        raise StageError("io.transforms-without-frames", what, f"it has no list named 'frames'{has}", _HINT)
+        raise StageError("io.transforms-without-frames", what, _why_no_frames(content), _HINT)
     if not (content["frames"] or may_be_empty):
         raise StageError("io.transforms-empty", what, "its list 'frames' is empty", _HINT)
     _check_frames(content["frames"], what)
     return content
+
+
+def _why_no_json(data: bytes, error: Exception) -> tuple[str, str]:
+    """Why a transforms file cannot be read, and what to do."""
+    if why := stand_in(data[:MAX_LETTERS]):
+        return why, _HINT
+    if isinstance(error, UnicodeDecodeError):
+        at = f"byte {error.start} is 0x{data[error.start]:02x}" if error.start < len(data) else str(error)
+        return f"it is not text in UTF-8 ({at})", "Save it as UTF-8, or export it again."
+    return f"it is not JSON ({error})", _JSON_HINT
+
+
+def _why_no_frames(content: Any) -> str:
+    if not isinstance(content, dict):
+        return "it has no list named 'frames': it is " + ("a list itself" if isinstance(content, list) else "one value")
+    if "frames" in content:
+        kind = "an object" if isinstance(content["frames"], dict) else ascii(content["frames"])[:MAX_LETTERS]
+        return f"its 'frames' is {kind} instead of a list"
+    return f"it has no list named 'frames': it has {_keys(content)}"
 
 
 def _check_frames(frames: list[Any], what: str) -> None:
@@ -146,8 +169,11 @@ def pose_matrix(matrix: Any) -> "Float[np.ndarray, '3 4']":
         pose = np.array(matrix, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError("its transform_matrix is not a matrix of numbers") from error
+    pose = pose.squeeze()
     if pose.shape in ((12,), (16,)):
         pose = pose.reshape(-1, 4)
+    if pose.shape == (4, 3):
+        raise ValueError("its transform_matrix is 4 × 3: it may be transposed")
     if pose.shape == (4, 4) and np.isfinite(pose).all() and pose[3, 3] and abs(pose[3, 3] - 1) > ROUNDED:
         pose = pose / pose[3, 3]
     if pose.shape == (4, 4) and (np.abs(pose[3, :3]) > ROUNDED).any():

@@ -6,14 +6,16 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from itertools import takewhile
 from pathlib import PurePosixPath
+from urllib.parse import unquote
 
+from stages.ingest.listing import IMAGES, RAW_EXTENSIONS
 from stages.io.photos import Photo
 
 
 def photos_by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
     """Photo by index of its image: of the same name, else of the name that ingest gave it, else of a name whose
-    accents are composed in another way, else of the same name below a folder that all have, else of the same end, else
-    of the same name but for its ending, else but for small and capital letters."""
+    accents are composed in another way, else of the name that it is as a URL, else of the same name below a folder that
+    all have, else of the same end, else of the same name but for its ending, else but for small and capital letters."""
     found: dict[int, Photo] = {}
     taken: set[str] = set()
     by_own, by_given = {photo.name: photo for photo in photos}, {photo.image_name: photo for photo in photos}
@@ -21,8 +23,10 @@ def photos_by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, P
         by_own,
         by_given,
         _by_key(names, photos, _composed),
+        _by_url(names, photos),
         _by_folder(names, photos),
         _by_end(names, photos),
+        _by_key(names, photos, _without_image_ending),
     )
     for photo_of in (*candidates, _by_key(names, photos, _without_ending), _by_key(names, photos, _without_case)):
         for index, name in enumerate(names):
@@ -85,6 +89,13 @@ def _by_key(names: Sequence[str], photos: Sequence[Photo], key: Callable[[str], 
     return {name: by_key[key_of] for name in names if images[key_of := key(name)] == 1 and key_of in by_key}
 
 
+def _by_url(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
+    """Photo by name of its image where that writes %20 for a space, say, and the last of its folders may be others."""
+    decoded = [unquote(name) for name in names]
+    found = _by_end(decoded, photos)
+    return {name: found[path] for name, path in zip(names, decoded, strict=True) if path != name and path in found}
+
+
 def other_spelling(name: str, photo: Photo) -> str | None:
     """A photo and its image in words, where their names differ by more than folders and accents."""
     same = name == photo.image_name or _last(name) == _last(photo.name)
@@ -97,6 +108,12 @@ def _composed(name: str) -> str:
 
 def _last(name: str) -> str:
     return PurePosixPath(_composed(name)).name
+
+
+def _without_image_ending(name: str) -> str:
+    """The name itself where it ends as no image does: IMG.2020.v1 of IMG.2020.v1.jpg."""
+    stem, ending = os.path.splitext(_composed(name))
+    return stem if ending.lower() in IMAGES + RAW_EXTENSIONS else stem + ending
 
 
 def _without_ending(name: str) -> str:

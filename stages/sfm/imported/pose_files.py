@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf.geometry.scene import Camera
-from stages.contract import Note, StageError
+from stages.contract import Note, StageError, listed
 from stages.ingest.sources import LLFF, own_registration
 from stages.io.colmap_files import MAX_COORDINATE
 from stages.io.photos import Photo
@@ -42,7 +42,14 @@ from stages.sfm.imported.llff import read_llff
 from stages.sfm.imported.orientation import fits_only_upright, pixel_map, stored_size
 from stages.sfm.imported.photo_names import other_spelling, photos_by_name
 from stages.sfm.imported.posed_photos import PosedPhoto, distinct, posed_photo, unusable, without_rays
-from stages.sfm.imported.transforms_intrinsics import contradictions, intrinsics_of, read_intrinsics
+from stages.sfm.imported.transforms_intrinsics import (
+    IN_PIXELS,
+    contradictions,
+    intrinsics_of,
+    is_one_angle,
+    read_intrinsics,
+    shared_intrinsics,
+)
 from stages.sfm.registration import told
 
 # The root mean square stretch of a matrix beside its scale, as an angle, is about what its rotation is off by where the
@@ -50,7 +57,7 @@ from stages.sfm.registration import told
 MAX_STRETCH_DEG, NOTED_STRETCH_DEG = 0.05, 0.005
 SCALED_WITHIN = 1e-3  # of 1: what rounding makes of a rotation's scale
 MAX_ENTRY = 1e6  # of a matrix that is looked at more closely: products of three of them are numbers
-SAME_POSE_WITHIN = 1e-9  # relatively: what printing makes of two copies
+SAME_POSE_WITHIN = 1e-6  # relatively: what floats of 32 bits make of two copies
 MAX_NAMES, MAX_NAMES_OF_ERROR = 5, 2
 APPROXIMATION = "approximation"  # how the note begins of a camera model that stands for another
 
@@ -130,6 +137,7 @@ def _from_transforms(
     if not framed:
         raise _nothing_usable(splits[0][0], found, photos)
     notes += _contradictions([content for _, content in splits], framed)
+    _check_shared([content for _, content in splits], list(framed.values()))
     upright = _are_of_upright_photos(framed.values())
     posed, rotations = zip(*(_from_frame(framed[file], upright, convention) for file in sorted(framed)), strict=True)
     notes += _rounded_or_scaled({one.name: rotation for one, rotation in zip(posed, rotations, strict=True)})
@@ -322,6 +330,25 @@ def _contradictions(files: Sequence[Mapping[str, Any]], framed: Mapping[str, _Fr
     return notes
 
 
+def _check_shared(files: Sequence[Mapping[str, Any]], framed: Sequence[_Framed]) -> None:
+    """Raises StageError where intrinsics of a file can be right for some of its photos alone: pixels without the size
+    that they are of, for photos of several sizes; one angle across, for photos that lie and photos that stand."""
+    stored, upright = ({size(one.photo) for one in framed} for size in (stored_size, lambda p: (p.width, p.height)))
+    if min(len(stored), len(upright)) < 2:
+        return
+    sizes = listed(sorted("{}×{}".format(*size) for size in stored), MAX_NAMES)
+    for file in files:
+        shared = [shared_intrinsics(one.frame, file) for one in framed]
+        where = f"the intrinsics of all frames, for photos of {len(stored)} sizes ({sizes})"
+        if any("w" not in one and not one.keys().isdisjoint(IN_PIXELS) for one in shared):
+            why = "they are in pixels, and no w and h tell of which size"
+            raise unusable("sfm.shared-pixels", where, f"{why}: write w and h beside them, or intrinsics in each frame")
+        stand = {one.photo.height > one.photo.width for one, of in zip(framed, shared, strict=True) if is_one_angle(of)}
+        if len(stand) > 1:
+            why = "one camera_angle_x cannot be that of photos that lie and of photos that stand"
+            raise unusable("sfm.shared-angle", where, f"{why}: write it in each frame")
+
+
 def _are_of_upright_photos(framed: Iterable[_Framed]) -> bool:
     """Whether the cameras are of photos that were turned upright first, as their shapes alone do not tell of half turns
     and squares: a frame names the photo beside the decoded, upright picture that its camera is of, as in our own
@@ -452,6 +479,7 @@ def _from_llff(
 
 def _from_colmap(folder: Path, photos: Sequence[Photo], convention: PoseConvention) -> ImportedPoses:
     given = _with_slashes(read_model(folder), photos)
+    repeated = _repeated(given, folder)
     photo_of = photos_by_name([image.file for image in given.images], photos)
     if not photo_of:
         raise _nothing_matches(str(folder), [image.file for image in given.images], photos)
@@ -473,7 +501,7 @@ def _from_colmap(folder: Path, photos: Sequence[Photo], convention: PoseConventi
     cameras, images = distinct(kept.values())
     model, behind = given.restricted(list(kept), pixel_maps, cameras, images).without_points_behind()
     notes = _notes(
-        [image.file for i, image in enumerate(given.images) if i not in photo_of],
+        [image.file for i, image in enumerate(given.images) if i not in photo_of and i not in repeated],
         {photo.name for photo in photos} - {photo.name for photo in photo_of.values()},
         posed.values(),
         left_out,
@@ -485,6 +513,9 @@ def _from_colmap(folder: Path, photos: Sequence[Photo], convention: PoseConventi
                 f"{len(others)} photos take the cameras of images whose names are spelt differently: {_few(others)}",
             )
         )
+    if repeated:
+        names = _few(sorted(given.images[i].file for i in repeated))
+        notes.append(Note("sfm.repeated-images", f"the model repeats {len(repeated)} images: {names}"))
     if not len(given.xyz):
         notes.append(Note("sfm.no-points", "the model has no points: near and far are estimated from the camera poses"))
     if behind:
@@ -502,6 +533,25 @@ def _with_slashes(model: SparseModel, photos: Sequence[Photo]) -> SparseModel:
     own = {photo.name for photo in photos}
     images = [replace(i, file=i.file if i.file in own else i.file.replace("\\", "/")) for i in model.images]
     return replace(model, images=images)
+
+
+def _repeated(model: SparseModel, folder: Path) -> set[int]:
+    """Which images of a model are there once more under an earlier number. Raises StageError where two images of a
+    name have different cameras or poses."""
+    first: dict[str, int] = {}
+    for i, image in enumerate(model.images):
+        one = model.images[first.setdefault(image.file, i)]
+        is_same = model.cameras[one.camera] == model.cameras[image.camera] and np.allclose(
+            one.sfm_from_camera, image.sfm_from_camera, rtol=SAME_POSE_WITHIN, atol=SAME_POSE_WITHIN
+        )
+        if not is_same:
+            raise StageError(
+                "sfm.two-images",
+                f"two images of {folder} have the name {image.file!r}",
+                "they have different cameras or poses, and nothing tells which of them is the photo's",
+                "Remove one of them; or put the photos of each camera into a folder of its own and export again.",
+            )
+    return set(range(len(model.images))) - set(first.values())
 
 
 def _is_of_upright_photos(folder: Path, given: SparseModel, photo_of: Mapping[int, Photo]) -> bool:

@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,8 +32,29 @@ CAMERA_MODEL = ("camera_model", "is_fisheye", *OTHER_CAMERA_MODELS)
 SIZE = ("w", "h")
 OF_INTRINSICS = {*FOCAL, *CENTRE, *DISTORTION, *CAMERA_MODEL, *SIZE}
 IN_PIXELS = {"fl_x": "w", "fl_y": "h", "cx": "w", "cy": "h"}  # of a picture of that side
-# How other programs spell these keys, and where they keep them: in a block of their own, or as a matrix.
-SPELLINGS = {"fx": "fl_x", "fy": "fl_y", "width": "w", "height": "h"}
+# How other programs spell these keys, in small letters without underscores: Fx, f_x, focal_length_x, image_width.
+SPELLINGS = {key.replace("_", ""): key for key in OF_INTRINSICS - {*TERM_LISTS}} | {
+    **{f"{name}{axis}": f"fl_{axis}" for name in ("f", "focal", "focallength") for axis in "xy"},
+    **{f"{name}{axis}": f"c{axis}" for name in ("pp", "principal", "principalpoint") for axis in "xy"},
+    **{f"{name}{side}": side[0] for name in ("", "image", "img", "camera") for side in ("width", "height")},
+}
+# Keys under which other programs say what camera_model says, and what they call camera models.
+MODEL_KEYS = ("camera_type", "projection_type", "distortion_model")
+MODEL_NAMES = {
+    **dict.fromkeys(("PERSPECTIVE", "PLUMB_BOB", "RADTAN", "BROWN"), "OPENCV"),
+    "EQUIDISTANT": FISHEYE,
+    "RATIONAL_POLYNOMIAL": RATIONAL,
+    **dict.fromkeys(("PANORAMIC", "SPHERICAL"), PANORAMA),
+}
+# Keys that say what is not read: terms in an order that nobody defines; what no camera model of COLMAP has; and how
+# large the pictures are, in which order nobody knows.
+UNREAD_TERMS = ("k", "p", "radial_distortion", "tangential_distortion", "radial", "tangential")
+UNREAD_PIXELS = ("skew", "b1", "b2")
+UNREAD_SHIFT = ("shift_x", "shift_y")
+UNREAD_SIZES = ("resolution", "image_size", "imageSize", "img_size")
+# The principal point lies at such a part of the way to the far corner as in pictures of another size.
+OTHER_SIZE_FROM, ON_DIAGONAL_WITHIN = 1.4, 0.1
+# Where they keep these keys: in a block of their own, or as a matrix.
 BLOCKS = ("camera", "intrinsics", "camera_intrinsics", "distortion", "intrinsic_matrix", "camera_matrix", "K")
 SAME_WITHIN = 0.01  # two focal lengths, relatively: files are rounded
 MAX_SKEW = 1e-3  # of a focal length: what rounding leaves
@@ -50,12 +71,25 @@ def intrinsics_of(frame: Mapping[str, Any], file: Mapping[str, Any]) -> dict[str
     and ``h``: a frame of another size and the same shape has them rescaled. Raises ValueError as
     :func:`with_usual_names` does.
     """
+    own = with_usual_names(frame)
+    return _rescaled(shared_intrinsics(frame, file), own) | own
+
+
+def shared_intrinsics(frame: Mapping[str, Any], file: Mapping[str, Any]) -> dict[str, Any]:
+    """The file's values of each group of intrinsics that the frame does not have. Raises ValueError as
+    :func:`with_usual_names` does."""
     own, shared = with_usual_names(frame), with_usual_names(file)
     other_model = any(key in own and own[key] != shared.get(key, False) for key in CAMERA_MODEL)
     for group in (FOCAL, CENTRE, DISTORTION, CAMERA_MODEL):
         if not own.keys().isdisjoint(group) or (group is DISTORTION and other_model):
             shared = {key: value for key, value in shared.items() if key not in group}
-    return _rescaled(shared, own) | own
+    return shared
+
+
+def is_one_angle(shared: Mapping[str, Any]) -> bool:
+    """Whether these values tell the focal length by the angle across alone, which is as wide as the picture is."""
+    given = shared.keys() & {*FOCAL}
+    return bool(given) and given <= {"camera_angle_x", "x_fov"}
 
 
 def _rescaled(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
@@ -66,7 +100,18 @@ def _rescaled(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, An
     except (KeyError, TypeError, ValueError, ZeroDivisionError):  # no size, or none that is one
         return dict(shared)
     is_same_shape = abs(scales["w"] - scales["h"]) <= SAME_WITHIN * abs(scales["h"])
+    if not is_same_shape and not shared.keys().isdisjoint(CENTRE) and _is_turned(scales, shared):
+        sizes = ("{}×{}".format(*(values[side] for side in SIZE)) for values in ({**shared, **own}, shared))
+        raise ValueError(
+            "its w and h are {}, and cx and cy of the file are of {}: write its own cx and cy".format(*sizes)
+        )
     return {**shared, **pixels} if is_same_shape and scales["w"] != 1 else dict(shared)
+
+
+def _is_turned(scales: Mapping[str, float], shared: Mapping[str, Any]) -> bool:
+    """Whether a frame whose sides are so much larger than the file's is of its shape, but upright where that lies."""
+    ratio = float(shared["h"]) / float(shared["w"])
+    return abs(scales["w"] - scales["h"] * ratio**2) <= SAME_WITHIN * abs(scales["w"])
 
 
 def with_usual_names(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -75,16 +120,32 @@ def with_usual_names(values: Mapping[str, Any]) -> dict[str, Any]:
     blocks = [_of_block(name, values[name]) for name in BLOCKS if values.get(name) is not None]
     found: dict[str, Any] = {}
     for level in (*blocks, values):
-        spelt = {SPELLINGS[key]: value for key, value in level.items() if key in SPELLINGS and value is not None}
+        spelt = {name: value for key, value in level.items() if value is not None and (name := _usual_name(key))}
         found |= spelt | {key: value for key, value in level.items() if value is not None}
+    if known := _known_model(found):
+        found["camera_model"] = known
     return found
+
+
+def _usual_name(key: str) -> str | None:
+    return None if key in OF_INTRINSICS or key in BLOCKS else SPELLINGS.get(key.lower().replace("_", ""))
+
+
+def _known_model(values: Mapping[str, Any]) -> str | None:
+    """The name here of the camera model that the values declare, under whatever key; None where they declare none, or
+    one that is not known."""
+    for key in ("camera_model", *MODEL_KEYS):
+        if isinstance(name := values.get(key), str):
+            name = MODEL_NAMES.get(name.upper(), name.upper())
+            return name if name in (*PERSPECTIVES[1:], *FISHEYES, PANORAMA) else None
+    return None
 
 
 def _of_block(name: str, block: Any) -> dict[str, Any]:
     """The intrinsics that a block of a file holds, or a matrix of them, row by row or column by column."""
     if isinstance(block, Mapping):
-        known = OF_INTRINSICS | SPELLINGS.keys()
-        return {key: value for key, value in block.items() if key in known}
+        known = {*OF_INTRINSICS, *MODEL_KEYS, *UNREAD_TERMS, *UNREAD_PIXELS, *UNREAD_SHIFT, *UNREAD_SIZES}
+        return {key: value for key, value in block.items() if key in known or _usual_name(key)}
     if not isinstance(block, list) or name in TERM_LISTS:
         return {}
     numbers = [number for row in block for number in (row if isinstance(row, list) else [row])]
@@ -120,6 +181,13 @@ def contradictions(values: Mapping[str, Any], width: int, height: int) -> list[s
             found.append(
                 f"{name} is {angle:.4g} and is read in degrees; a value in radians belongs in camera_angle_{axis}"
             )
+    try:
+        centre, sides = (tuple(float(values[key]) for key in keys) for keys in (CENTRE, SIZE))
+        found += [
+            f"{other}; this is right only if they were cropped" for other in [_of_other_size(centre, sides)] if other
+        ]
+    except (KeyError, TypeError, ValueError):
+        pass
     terms = values.get("distortion_params")
     if isinstance(terms, list) and len(terms) == len(NERFSTUDIOS):
         other = [name for name, term in zip(NERFSTUDIOS, terms, strict=True) if values.get(name, term) != term]
@@ -153,6 +221,8 @@ def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: f
         raise ValueError(_why_no_focal_length(values))
     fx, fy = (given[0] if one is None else one for one in along)
     pinhole = (fx, fy, number("cx", w / 2), number("cy", h / 2))
+    if not {*SIZE} <= values.keys() and (other := _of_other_size(pinhole[2:], (w, h))):
+        raise ValueError(f"{other}; write the w and h that they are of")
     k = [number(f"k{i}", 0.0) for i in range(1, 7)]
     p, s = [number("p1", 0.0), number("p2", 0.0)], [number("sx1", 0.0), number("sy1", 0.0)]
     model, distortion = _distortion(k, p, s, declared)
@@ -160,6 +230,19 @@ def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: f
     if why_degenerate := why_unusable(camera):
         raise ValueError(why_degenerate)
     return camera
+
+
+def _of_other_size(centre: Sequence[float], size: Sequence[float]) -> str | None:
+    """Words for a principal point that lies where it would in pictures of the same shape and another size."""
+    if not min(size) > 0:
+        return None
+    across, down = (2 * at / side for at, side in zip(centre, size, strict=True))
+    is_on_diagonal = across > 0 and abs(down / across - 1) <= ON_DIAGONAL_WITHIN
+    if not is_on_diagonal or 1 / OTHER_SIZE_FROM < across < OTHER_SIZE_FROM:
+        return None
+    at = ", ".join(f"{value:.5g}" for value in centre)
+    photo, other = ("×".join(f"{side:.5g}" for side in sides) for sides in (size, [2 * value for value in centre]))
+    return f"its principal point ({at}) is far from the middle of {photo} pixels, as in pictures of about {other}"
 
 
 def _why_no_focal_length(values: Mapping[str, Any]) -> str:
@@ -207,6 +290,8 @@ def _with_named_terms(values: Mapping[str, Any]) -> Mapping[str, Any]:
             raise ValueError(
                 f"it has distortion as {name}, a list of no defined order; write k1, k2, p1, p2, k3 instead"
             )
+    if unread := _unread(values):
+        raise ValueError(unread)
     if "distortion_params" not in values:
         return values
     terms = values["distortion_params"]
@@ -215,6 +300,25 @@ def _with_named_terms(values: Mapping[str, Any]) -> Mapping[str, Any]:
             f"its distortion_params are not the six numbers {', '.join(NERFSTUDIOS)}, in nerfstudio's order"
         )
     return {**values, **dict(zip(NERFSTUDIOS, terms, strict=True))}
+
+
+def _unread(values: Mapping[str, Any]) -> str | None:
+    """Words for a key that says something of the camera and is not read here; None where there is none, and where it
+    says nothing, as 0 does."""
+    for name in UNREAD_TERMS:
+        if isinstance(terms := values.get(name), list) and np.array(terms, dtype=object).any():
+            return f"it has {name}, which is not read; write k1, k2, p1, p2, k3 instead"
+    for name in UNREAD_PIXELS:
+        if abs(_finite(values.get(name) or 0, name)) > MAX_SKEW * abs(_finite(values.get("fl_x") or 1000, "fl_x")):
+            return f"its {name} is {values[name]}, which no supported camera model has; undistort the photos with it"
+    if values.keys().isdisjoint(CENTRE):
+        for name in UNREAD_SHIFT:
+            if _finite(values.get(name) or 0, name):
+                return f"its {name} is {values[name]}, which is not read; write cx and cy in pixels"
+    for name in UNREAD_SIZES:
+        if isinstance(values.get(name), list) and values.keys().isdisjoint(SIZE):
+            return f"its {name} is {repr(values[name])[:MAX_LETTERS]}, which is not read; write w and h instead"
+    return None
 
 
 def _declared(values: Mapping[str, Any]) -> str:

@@ -216,6 +216,8 @@ def test_what_is_no_image_is_named(tmp_path: Path) -> None:
         "notes.jpg": (b"Dear diary,\nno photo today.\n", "not-an-image"),
         "empty.jpg": (b"", "empty-file"),
         "noise.jpg": (bytes(range(256)), "not-an-image"),
+        "lfs.jpg": (b"version https://git-lfs.github.com/spec/v1\noid sha256:1\n", "stand-in"),
+        "page.jpg": (b"<!DOCTYPE html>\n<html>404</html>", "stand-in"),
         "half.jpg": (b"\xff\xd8\xff\xe0", "damaged-file"),
         "page.png": (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 50 50\n", "not-an-image"),
     }

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from stages.contract import StageError
 from stages.ingest.frame_files import FrameFiles
 from stages.ingest.sources import find_source, unused_masks
 from tests.refusals import refused
@@ -31,6 +32,8 @@ def apart(name: str) -> str:
         (apart("images/Küche_01.jpg"), "images/Küche_01.jpg"),
         ("Küche/01.jpg", apart("Küche/01.JPG")),
         ("Küche/ä", apart("Küche/ä.png")),
+        (" images/a.jpg\n", "images/a.jpg"),
+        ("file:///me/images/a.jpg\n", "images/a.jpg"),
     ],
 )
 def test_a_photo_is_found_in_another_spelling(tmp_path: Path, written: str, there: str) -> None:
@@ -177,6 +180,31 @@ def test_masks_of_transforms_files_are_found_in_another_spelling(tmp_path: Path)
     frame = {"file_path": "a.jpg", "mask_path": "masks/a.png", "transform_matrix": []}
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
     assert find_source(tmp_path / "transforms.json").masks[0] == ("a.jpg.png", tmp_path / "masks/a.PNG")
+
+
+@pytest.mark.parametrize("given", ["set/transforms.json", "set", "set/images"])
+@pytest.mark.parametrize("folder", ["/home/me/masks/", "C:\\me\\masks\\", "file:///me/masks/"])
+def test_masks_of_another_machine_are_no_photos(tmp_path: Path, folder: str, given: str) -> None:
+    """A photo has the name of its mask but for the ending, or the whole of it."""
+    touch(tmp_path, "set/images/a.jpg", "set/images/b.png", "set/images/c.png", "set/masks/a.png", "set/masks/b.png")
+    frames = [
+        {"file_path": f"images/{photo}", "mask_path": f"{folder}{photo[0]}.png", "transform_matrix": []}
+        for photo in ("a.jpg", "b.png")
+    ]
+    cameras = tmp_path / "set/transforms.json"
+    cameras.write_text(json.dumps({"frames": frames}))
+    source = find_source(tmp_path / given, None if given.endswith("json") else cameras)
+    assert [file.relative_to(tmp_path / "set").as_posix() for _, file in source.masks[:2]] == [
+        "masks/a.png",
+        "masks/b.png",
+    ]
+    (tmp_path / "set/masks/b.png").unlink()
+    assert source.other_endings == {}
+    try:
+        lost = find_source(tmp_path / given, None if given.endswith("json") else cameras).masks[1][1]
+        assert not lost.is_file(), "which is said of its photo"
+    except StageError as error:
+        assert error.code == "ingest.outside-folder"
 
 
 def test_masks_named_by_our_export_are_copies(tmp_path: Path) -> None:

@@ -111,6 +111,12 @@ def test_too_few_photos_in_words_that_fit(tmp_path: Path, progress: Any) -> None
     assert error.code == "ingest.no-usable-photo" and f"1 files in {tmp_path}/none" in error.what
     assert error.why.startswith("a.jpg: ")
 
+    for ending, data, helps in (("cr3", b"raw", "JPEG"), ("jpg", b"<html>", "download"), ("jpg", b"", "again")):
+        for file in (tmp_path / "none").iterdir():
+            file.unlink()
+        (tmp_path / f"none/a.{ending}").write_bytes(data)
+        assert helps in failure(tmp_path / "none", tmp_path / "out2", progress).hint
+
     put(tmp_path / "same", "a.png")
     (tmp_path / "same/b.png").write_bytes((tmp_path / "same/a.png").read_bytes())
     error = failure(tmp_path / "same", tmp_path / "out3", progress)
@@ -327,7 +333,9 @@ def test_only_photos_named_by_the_cameras_are_taken(tmp_path: Path, progress: An
     ]
     assert read_frame_names(tmp_path / "out")["images/a"] == "images/a.png"
     assert result.line == "3 photos 32×24, poses imported, 1 rejected"
-    assert progress.codes == ["ingest.rejected"] and progress.names("ingest.rejected", "images/gone.png")
+    assert progress.codes == ["ingest.photos-without-frame", "ingest.rejected"] and progress.names(
+        "ingest.rejected", "images/gone.png"
+    )
 
 
 def test_what_is_opaque_is_noted(tmp_path: Path, progress: Any) -> None:

@@ -114,10 +114,11 @@ def test_a_picture_that_is_cut_out_masks_by_its_alpha(tmp_path: Path) -> None:
 
 def test_masks_may_say_that_they_are(tmp_path: Path) -> None:
     strange = ["d_mask.png", "e_mask.png", "mask_e.png", "masks.png"]
-    files = ["a_mask.png", "mask_b.png", "left/c.mask.jpg", "d.png", *strange]
+    files = ["a_mask.png", "mask_b.png", "left/c.mask.jpg", "d.png", "dynamic_mask_f.png", *strange]
     named = [(name, tmp_path / name) for name in files]
-    paired, strays = pair_masks(["a.jpg", "b.jpg", "left/c.jpg", "d.jpg", "e.jpg"], named)
+    paired, strays = pair_masks(["a.jpg", "b.jpg", "left/c.jpg", "d.jpg", "e.jpg", "f.jpg"], named)
     of = {"a.jpg": "a_mask.png", "b.jpg": "mask_b.png", "left/c.jpg": "left/c.mask.jpg", "d.jpg": "d.png"}
+    of["f.jpg"] = "dynamic_mask_f.png"
     assert paired == {photo: tmp_path / mask for photo, mask in of.items()}
     assert strays == [tmp_path / name for name in strange]
 
@@ -134,6 +135,23 @@ def test_white_is_ignored_in_masks_of_instant_ngp(tmp_path: Path, white: int) ->
     mask = np.where(ignoring(10, 20) > 0, 0, white).astype(np.uint8)
     found = read_mask(saved(tmp_path, mask, "dynamic_mask_a.png"), WIDTH, HEIGHT, 1)
     np.testing.assert_array_equal(found.pixels, ignoring(10, 20))
+
+
+def test_masks_may_be_called_in_capitals(tmp_path: Path) -> None:
+    named = [(name, tmp_path / name) for name in ("A.JPG.PNG", "left/B.png", "C.png", "c.PNG", "D.png")]
+    paired, strays = pair_masks(["a.jPg", "left/b.jpg", "c.jpg", "d.jpg", "D.JPG"], named)
+    of = {"a.jPg": "A.JPG.PNG", "left/b.jpg": "left/B.png", "c.jpg": "c.PNG", "D.JPG": "D.png"}
+    assert paired == {photo: tmp_path / mask for photo, mask in of.items()}
+    assert strays == [tmp_path / "C.png"]
+
+
+def test_what_losses_leave_of_black_ignores_nothing(tmp_path: Path) -> None:
+    white = np.zeros((8 * HEIGHT, 8 * WIDTH), np.uint8)
+    white[:80, 100:] = 255
+    Image.fromarray(white).save(tmp_path / "dynamic_mask_a.jpg", quality=60)
+    assert ((np.asarray(Image.open(tmp_path / "dynamic_mask_a.jpg")) > 0) != (white > 0)).any()
+    found = read_mask(tmp_path / "dynamic_mask_a.jpg", 8 * WIDTH, 8 * HEIGHT, 1)
+    np.testing.assert_array_equal(found.pixels, 255 - white)
 
 
 @pytest.mark.parametrize("kind", ["photos", "transforms"])

@@ -19,6 +19,7 @@ from stages.ingest.sources import (
     is_gone,
     mask_beside,
     photos_beside,
+    photos_without_frame,
     unused_cameras,
     unused_masks,
 )
@@ -259,7 +260,14 @@ def test_frames_may_not_leave_their_folder(tmp_path: Path, file_path: str) -> No
     ("content", "code", "named"),
     [
         ("{", "not-json", ()),
-        ("[1]", "without-frames", ()),
+        ("[1]", "without-frames", ("a list itself",)),
+        ('{"frames": {"0": {}}}', "without-frames", ("an object",)),
+        ('{"frames": null}', "without-frames", ("None",)),
+        ("", "not-json", ("empty",)),
+        ("version https://git-lfs.github.com/spec/v1\noid", "not-json", ("git lfs pull",)),
+        ("\n<!DOCTYPE html><html>", "not-json", ("web page",)),
+        ('{"frames": [],\n}', "not-json", ("line 2", "comma")),
+        ('{"name": "M\udcfcller"}', "not-json", ("UTF-8", "byte 11", "0xfc")),
         ('{"frames": []}', "empty", ()),
         ('{"frames": [{"file_path": "a.jpg"}]}', "incomplete-frame", ("frame 0", "transform_matrix", "file_path")),
         ('{"frames": [{"path": 1, "c2w": 2}]}', "incomplete-frame", ("frame 0", "file_path", "path, c2w")),
@@ -269,7 +277,7 @@ def test_frames_may_not_leave_their_folder(tmp_path: Path, file_path: str) -> No
     ],
 )
 def test_a_transforms_file_that_is_none(tmp_path: Path, content: str, code: str, named: tuple[str, ...]) -> None:
-    (tmp_path / "transforms.json").write_text(content)
+    (tmp_path / "transforms.json").write_bytes(content.encode("utf-8", "surrogateescape"))
     with refused(f"io.transforms-{code}", *named):
         find_source(tmp_path / "transforms.json")
 
@@ -279,6 +287,28 @@ def test_a_transforms_file_without_its_photos(tmp_path: Path) -> None:
     cameras = transforms(tmp_path / "transforms.json", "images/frame_1.jpg", "images/frame_2.jpg")
     with refused("ingest.cameras-of-other-photos", 2, "images/frame_1.jpg", f"{tmp_path}/photos", "DSC_1.jpg"):
         find_source(tmp_path / "photos", cameras)
+
+
+def test_photos_that_no_frame_names_are_listed(tmp_path: Path) -> None:
+    others = ["images/c.JPG", "images/sub/d.png", "images/.e.jpg", "images/f.txt", "images/b_mask.png", "thumbs/a.jpg"]
+    touch(tmp_path, "images/a.jpg", "images/b.jpg", "images/dynamic_mask_a.png", "images/a_depth.png", *others)
+    source = find_source(transforms(tmp_path / "transforms.json", "images/a.jpg", "images/b.jpg", "images/gone.jpg"))
+    assert photos_without_frame(source) == ["images/c.JPG"]
+    assert photos_without_frame(find_source(tmp_path)) == []
+
+
+def test_what_systems_keep_is_no_photo(tmp_path: Path) -> None:
+    kept = ["@eaDir/a.jpg/SYNOPHOTO_THUMB_M.jpg", "$RECYCLE.BIN/$R1.jpg", "__MACOSX/._a.jpg", "#recycle/b.jpg"]
+    touch(tmp_path, "a.jpg", "sub/b.jpg", "sub/@eaDir/b.jpg", *kept)
+    assert names(find_source(tmp_path)) == ["a.jpg", "sub/b.jpg"]
+
+
+def test_a_linked_folder_in_an_empty_one_is_named(tmp_path: Path) -> None:
+    touch(tmp_path, "disk/a.jpg", "set/.hidden")
+    (tmp_path / "set/photos").symlink_to(tmp_path / "disk")
+    error = refusal(tmp_path / "set")
+    assert error.code == "ingest.empty-folder" and "photos" in error.why
+    assert error.hint.endswith(f"pipeline run {tmp_path}/disk")
 
 
 def test_words_for_what_cannot_be_used(tmp_path: Path) -> None:
@@ -326,6 +356,13 @@ def test_words_for_cameras_that_cannot_be_used(tmp_path: Path) -> None:
     ):
         with refused("ingest.unknown-cameras", name, what, hint):
             find_source(tmp_path / "photos", touch(tmp_path, name) / name)
+
+
+def test_files_of_a_colmap_model_may_be_in_capitals(tmp_path: Path) -> None:
+    touch(tmp_path, "images/a.jpg", "m/sparse/Cameras.txt", "m/sparse/IMAGES.TXT", "m/sparse/points3d.txt")
+    source = find_source(tmp_path / "images", tmp_path / "m")
+    assert source.cameras == tmp_path / "m/sparse"
+    assert [file.name for file in camera_files(tmp_path / "m/sparse")] == ["Cameras.txt", "IMAGES.TXT", "points3d.txt"]
 
 
 def test_what_is_missing_of_a_colmap_model_is_named(tmp_path: Path) -> None:
@@ -401,8 +438,12 @@ def test_masks_of_reduced_photos_go_before_others(tmp_path: Path) -> None:
     touch(tmp_path, "images_4/a.jpg", "masks/a.png", "masks_4/a.png", "masks_8/a.png")
     source = find_source(tmp_path / "images_4")
     assert source.masks == (("a.png", tmp_path / "masks_4/a.png"),)
-    other = find_source(touch(tmp_path, "other/images/a.jpg", "other/mask_2/a.png") / "other")
-    assert other.masks == () and unused_masks(other) == tmp_path / "other/mask_2"
+
+
+@pytest.mark.parametrize("folder", ["mask_2", "object_masks", "Segmentation", "seg", "alpha"])
+def test_folders_beside_photos_that_may_be_of_masks(tmp_path: Path, folder: str) -> None:
+    source = find_source(touch(tmp_path, "images/a.jpg", f"{folder}/a.png", "scans/a.png", "depth/a.png"))
+    assert source.masks == () and unused_masks(source) == tmp_path / folder
 
 
 def test_masks_are_listed_by_their_names_without_folder(tmp_path: Path) -> None:

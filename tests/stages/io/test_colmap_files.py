@@ -192,6 +192,27 @@ def overwritten(path: Path, place: int, form: str, value: float) -> None:
     path.write_bytes(content)
 
 
+def test_files_may_be_in_capitals(model: Path) -> None:
+    expected = read_model_files(model)
+    for file in list(model.iterdir()):
+        file.rename(model / file.name.upper())
+    found = read_model_files(model)
+    assert found.cameras == expected.cameras and found.points == expected.points
+    assert [image.name for image in found.images.values()] == image_names(model)
+
+
+@pytest.mark.parametrize("part", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [(b"", "empty"), (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"), (b"<html>", "web page")],
+)
+def test_what_stands_in_for_a_file_is_named(part: str, content: bytes, why: str, tmp_path: Path) -> None:
+    written(tmp_path, "bin")
+    (tmp_path / f"{part}.bin").write_bytes(content)
+    with refused("sfm.damaged-model", f"{part}.bin", why):
+        read_model(tmp_path)
+
+
 @pytest.mark.parametrize("count", [2**64 - 1, 2**63, 2**40, 5])
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 def test_a_count_that_is_too_large_ends_with_the_file(name: str, count: int, tmp_path: Path) -> None:

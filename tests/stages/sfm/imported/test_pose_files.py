@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -140,6 +141,9 @@ MATRIX = [[50.0, 0, 31], [0, 52, 19], [0, 0, 1]]
         {"intrinsic_matrix": np.pad(MATRIX, (0, 1)).tolist()},
         {"intrinsics": LENS, "K": None, "fx": None},
         {"fx": 99.0, "K": np.eye(3).tolist()} | LENS,
+        {"F_X": 50.0, "focal_length_y": 52.0, "principal_point_x": 31.0, "CY": 19.0},
+        {"fl_x": 100.0, "fl_y": 104.0, "cx": 62.0, "cy": 38.0, "image_width": 2 * W, "imageHeight": 2 * H},
+        {"camera": LENS | {"camera_type": "perspective", "skew": 0.0}, "radial_distortion": [0, 0], "K1": 0},
     ],
 )
 def test_intrinsics_in_other_spellings(read, spelt: dict[str, Any]) -> None:
@@ -213,6 +217,62 @@ def test_contradictory_intrinsics_are_named(
     assert note.code.endswith("-contradicts-itself") and all(part in note.text for part in named)
 
 
+def test_a_principal_point_far_from_the_middle_is_named(read) -> None:
+    """Cropped photos have one, and so have intrinsics of another size."""
+    own = frame(1, w=W, h=H, cx=62.0, cy=38.0)
+    (note,) = read([frame(0), own, frame(2)], **LENS).notes
+    assert note.code == "sfm.frame-contradicts-itself" and "./1" in note.text and "(62, 38)" in note.text
+    assert read([frame(0), frame(1, w=W, h=H, cx=40.0, cy=38.0), frame(2)], **LENS).notes == []
+
+
+@pytest.mark.parametrize(
+    ("declared", "model"),
+    [
+        ({"camera_type": "Fisheye"}, "OPENCV_FISHEYE"),
+        ({"camera_model": "opencv_fisheye"}, "OPENCV_FISHEYE"),
+        ({"distortion_model": "equidistant"}, "OPENCV_FISHEYE"),
+        ({"camera": {"camera_type": "FISHEYE"}}, "OPENCV_FISHEYE"),
+        ({"distortion_model": "plumb_bob"}, "OPENCV"),
+        ({"camera_model": "PERSPECTIVE"}, "OPENCV"),
+        ({"camera_type": "phone"}, "OPENCV"),
+        ({"camera_model": "OPENCV", "camera_type": "FISHEYE"}, "OPENCV"),
+        ({"distortion_model": "rational_polynomial", "k4": 0.1}, "FULL_OPENCV"),
+    ],
+)
+def test_camera_models_have_other_names(read, declared: dict[str, Any], model: str) -> None:
+    (camera,) = read([frame(i) for i in range(3)], k1=0.1, **declared, **LENS).model.cameras
+    assert camera.model == model
+
+
+def test_intrinsics_for_photos_of_several_sizes_have_a_size(read) -> None:
+    photos = [photo(0), photo(1, W // 2, H // 2), photo(2)]
+    with refused("sfm.shared-pixels", "30×20, 60×40", "no w and h"):
+        read([frame(0), frame(1, w=W // 2, h=H // 2), frame(2)], photos=photos, **LENS)
+    known = read([frame(i) for i in range(3)], photos=photos, w=W, h=H, **LENS)
+    own = read(
+        [frame(0), frame(1, w=30, h=20, fl_x=25.0, fl_y=26.0, cx=15.5, cy=9.5), frame(2)],
+        photos=photos,
+        w=W,
+        h=H,
+        **LENS,
+    )
+    for one in (known, own):
+        camera = one.model.cameras[one.model.images[1].camera]
+        assert (camera.width, camera.height, *camera.params) == pytest.approx((30, 20, 25, 26, 15.5, 9.5))
+    turned = [photo(0), dataclasses.replace(photo(1, H, W), orientation=6), photo(2)]
+    assert len(read([frame(i) for i in range(3)], photos=turned, **LENS).model.images) == 3, "one size as stored"
+
+
+def test_photos_that_lie_and_stand_share_no_angle(read) -> None:
+    photos = [photo(0), photo(1, H, W), photo(2)]
+    with refused("sfm.shared-angle", "40×60, 60×40", "camera_angle_x"):
+        read([frame(i) for i in range(3)], photos=photos, camera_angle_x=1.0)
+    with refused("sfm.frame-intrinsics", "./1", "40×60", "60×40", "cx and cy"):
+        read([frame(0), frame(1, w=H, h=W), frame(2)], photos=photos, w=W, h=H, **LENS)
+    own = read([frame(0), frame(1, camera_angle_x=0.7), frame(2)], photos=photos, camera_angle_x=1.0).model
+    assert own.cameras[own.images[1].camera].params[0] == pytest.approx(H / 2 / math.tan(0.35))
+
+
 def _with(row: int, column: int, value: float) -> list[list[float]]:
     pose = matrix(1).tolist()
     pose[row][column] = value
@@ -275,10 +335,20 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"dist_coeffs": [0.1, 0.0, 0.0, 0.0]}, r"dist_coeffs.*k1, k2, p1, p2"),
         ({"camera": {"distortion": [0.1, 0.0, 0.0, 0.0]}}, r"distortion.*k1, k2, p1, p2"),
         ({"cx": 0.5, "cy": 0.5}, r"principal point \(0\.5, 0\.5\)"),
+        ({"cx": 62.0, "cy": 38.0}, r"\(62, 38\) is far from the middle of 60×40 .* about 124×76; write the w and h"),
+        ({"cx": 15.0, "cy": 10.0}, r"\(15, 10\) is far from the middle of 60×40 .* about 30×20; write the w and h"),
+        ({"k": [0.1, 0.0]}, r"it has k, which is not read; write k1"),
+        ({"intrinsics": {"radial_distortion": [0.1]}}, r"it has radial_distortion, which is not read"),
+        ({"skew": -2.0}, r"its skew is -2\.0, which no supported camera model has"),
+        ({"cx": None, "shift_x": 0.1}, r"its shift_x is 0\.1, which is not read; write cx"),
+        ({"resolution": [120, 80]}, r"its resolution is \[120, 80\], which is not read; write w and h"),
+        ({"camera_type": "SPHERICAL"}, r"panoramas are not supported"),
+        ({"transform_matrix": matrix(1)[:3].T.tolist()}, r"its transform_matrix is 4 × 3: it may be transposed"),
     ],
 )
 def test_what_is_no_camera_is_refused_by_name(read, changes: dict[str, Any], message: str) -> None:
-    lens = {} if changes.get("fl_x", 1) is None else LENS
+    lens = {} if None in (changes.get("fl_x", 1), changes.get("cx", 1)) else LENS
+    changes = {"fl_x": 50.0} | changes if "shift_x" in changes else changes
     with pytest.raises(StageError, match=message) as raised:
         read([frame(0, fl_x=50.0), frame(1, **changes), frame(2)], **lens)
     assert "frame './1' of transforms.json" in raised.value.what
@@ -380,10 +450,11 @@ def test_files_of_nerfstudios_converters_are_read(read, program: str) -> None:
 
 
 def test_a_matrix_may_be_a_flat_list_of_its_rows(read) -> None:
-    flat = read([frame(i, transform_matrix=matrix(i).ravel().tolist()) for i in range(3)], **LENS)
     plain = read([frame(i) for i in range(3)], **LENS)
-    for one, other in zip(flat.model.images, plain.model.images, strict=True):
-        np.testing.assert_array_equal(one.sfm_from_camera, other.sfm_from_camera)
+    for reshaped in (np.ravel, lambda m: m[None], lambda m: m[:3, :, None]):
+        given = read([frame(i, transform_matrix=reshaped(matrix(i)).tolist()) for i in range(3)], **LENS)
+        for one, other in zip(given.model.images, plain.model.images, strict=True):
+            np.testing.assert_array_equal(one.sfm_from_camera, other.sfm_from_camera)
 
 
 def test_a_matrix_may_be_homogeneous(read) -> None:
@@ -413,7 +484,7 @@ def test_a_photo_has_one_frame(read) -> None:
             read([frame(1), second], **LENS)
 
 
-@pytest.mark.parametrize("rounding", [0.0, 1e-12])
+@pytest.mark.parametrize("rounding", [0.0, 1e-12, 1e-7])
 def test_frames_that_are_listed_twice_alike_count_once(read, rounding: float) -> None:
     again = frame(1, transform_matrix=(matrix(1) + np.pad([[rounding]], (0, 3))).tolist())
     known = read([frame(0), frame(1), again, frame(2)], **LENS)
@@ -510,6 +581,25 @@ def test_a_colmap_model_that_was_written_on_windows(tmp_path: Path) -> None:
     assert known.notes == []
 
 
+def test_two_images_of_one_name_are_one_or_refused(tmp_path: Path) -> None:
+    colmap_model(tmp_path, ["ä0.png", "ä1.png", "ä2.png"])
+    text = tmp_path / "text"
+    text.mkdir()
+    pycolmap.Reconstruction(tmp_path).write_text(text)
+    (text / "points3D.txt").unlink()
+    lines = (text / "images.txt").read_text().splitlines()
+    first = next(i for i, line in enumerate(lines) if line.endswith("ä0.png"))
+    _, *rest = lines[first].split()
+    (text / "images.txt").write_text("\n".join([*lines, " ".join(["9", *rest]), ""]) + "\n")
+    known = read_poses(text, PHOTOS, {})
+    assert [image.file for image in known.model.images] == ["a0.png", "a1.png", "a2.png"]
+    assert codes(known.notes) == ["sfm.repeated-images", "sfm.no-points"] and "ä0.png" in known.notes[0].text
+    moved = [rest[0], *rest[1:4], "7.5", *rest[5:]]
+    (text / "images.txt").write_text("\n".join([*lines, " ".join(["9", *moved]), ""]) + "\n")
+    with refused("sfm.two-images", "ä0.png", str(text)):
+        read_poses(text, PHOTOS, {})
+
+
 def test_a_colmap_model_of_larger_photos_is_scaled(tmp_path: Path) -> None:
     colmap_model(tmp_path, ["ä0.png", "ä1.png"])
     known = read_poses(tmp_path, [photo(0, W // 2, H // 2), photo(1)], {})
@@ -555,6 +645,13 @@ def test_a_name_that_two_photos_share_matches_neither(tmp_path: Path) -> None:
         (["IMG_0.JPG", "B/1.PNG"], ["img_0.jpg", "b/1.png"], {0: "img_0.jpg", 1: "b/1.png"}),
         (["IMG_0.JPG"], ["img_0.jpg", "Img_0.jpg"], {}),
         (["a\u0308.png", "b/o\u0308.jpg"], ["\u00e4.png", "\u00f6.jpg"], {0: "\u00e4.png", 1: "\u00f6.jpg"}),
+        (["a%20b/0%2e.jpg", "c%20.png"], ["a b/0..jpg", "c .png"], {0: "a b/0..jpg", 1: "c .png"}),
+        (["set%201/a%20b.jpg", "a%20c.jpg"], ["a b.jpg", "a%20c.jpg", "a c.jpg"], {0: "a b.jpg", 1: "a%20c.jpg"}),
+        (
+            ["IMG.2020.1", "IMG.2020.2"],
+            ["IMG.2020.1.jpg", "IMG.2020.2.JPG"],
+            {0: "IMG.2020.1.jpg", 1: "IMG.2020.2.JPG"},
+        ),
         (["c/a\u0308.jpg", "c/a\u0308.png"], ["c/\u00e4.jpg", "c/\u00e4.png"], {0: "c/\u00e4.jpg", 1: "c/\u00e4.png"}),
     ],
 )
