@@ -33,8 +33,8 @@ STAGES: dict[str, ModuleType] = {
         train,
         evaluate,
         render,
-        viewer,
         mesh,
+        viewer,
         tradeoff,
         report,
     )

@@ -26,7 +26,7 @@ from starlette.routing import Route
 
 from pipeline.view.workspace_state import FINISHED, WorkspaceState
 from stages.contract import StageError
-from stages.viewer.page import page
+from stages.viewer.page import page, watching
 
 ADDRESS = "127.0.0.1"
 TOKEN_BYTES = 24
@@ -133,9 +133,9 @@ class ViewServer:
         return response
 
     def _page(self, request: Request) -> Response:
-        """viewer.html where that is finished, else the page that follows the training."""
+        """viewer.html where that is finished, which notices another training; else the page that follows one."""
         file = self.state.finished_page()
-        return Response(page("live") if file is None else file.read_bytes(), media_type="text/html")
+        return Response(page("live") if file is None else watching(file.read_text("utf-8")), media_type="text/html")
 
     def _state(self, request: Request) -> Response:
         self.asked, told = time.monotonic(), self.state.watched()

@@ -13,8 +13,8 @@ from tyro.conf import Suppress
 from stages.contract import READING_SECONDS, Inputs, Progress, StageConfig, StageResult, Workload
 from stages.io.files import write_json
 
-INPUTS = ("ingest", "sfm", "normalise", "scale", "effects", "train", "evaluate", "render", "viewer", "mesh", "tradeoff")
-VERSION = 15
+INPUTS = ("ingest", "sfm", "normalise", "scale", "effects", "train", "evaluate", "render", "mesh", "viewer", "tradeoff")
+VERSION = 16
 EXIT_CODE = 18
 RESUMES = False
 SUMMARY = True

@@ -12,7 +12,7 @@ from pydantic import Field
 from stages.contract import READING_SECONDS, Inputs, Progress, StageConfig, StageResult, Workload
 
 INPUTS = ("ingest", "normalise", "scale", "train")
-VERSION = 3
+VERSION = 4
 EXIT_CODE = 21
 RESUMES = False
 PUBLISHED = ("viewer.html",)
@@ -24,10 +24,18 @@ class Config(StageConfig):
     photos: Literal["on", "off"] = Field(
         default="on", description="Whether small copies of the photos are in the page, to compare with the field."
     )
+    mesh: Literal["on", "off"] = Field(
+        default="on", description="Whether a small copy of the mesh is in the page, as a layer; at most 0.3 MB."
+    )
     bits: Literal["auto", "8", "16"] = Field(
         default="auto",
         description="Bits per number of the grids: 8, or 16 where 8 lose more than 0.05 dB of held-out PSNR.",
     )
+
+
+def more_inputs(config: Config) -> tuple[str, ...]:
+    """The mesh, where the page is to have it."""
+    return ("mesh",) if config.mesh == "on" else ()
 
 
 def expected_seconds(config: Config, workload: Workload) -> float:
@@ -37,7 +45,7 @@ def expected_seconds(config: Config, workload: Workload) -> float:
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
-    """Pack the field, the cameras, small photos and sparse points; write viewer.html."""
+    """Pack the field, the cameras, small photos, sparse points and the mesh; write viewer.html."""
     from stages.viewer import page
     from stages.viewer.contents import load
 

@@ -1,4 +1,4 @@
-"""What the page holds: the field in few bits and what that costs, cameras, small photos, sparse points."""
+"""What the page holds: the field in few bits and what that costs, cameras, small photos, sparse points, the mesh."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -22,6 +22,7 @@ from stages.effects.image_effects import new_view_effects, new_view_words, photo
 from stages.hardware.device import processors
 from stages.io.files import read_json, read_scene, read_tensors
 from stages.io.photos import spread
+from stages.mesh.preview import SMALL_COPY
 from stages.render.path import median_camera
 from stages.render.renderer import Renderer, load_renderer
 from stages.scale import metres_per_unit
@@ -81,6 +82,8 @@ def load(config: "Config", inputs: Inputs, progress: Progress) -> Contents:
         )
     table, comparison = _table(config, inputs, renderer, field, scene, progress)
     parts = sections(renderer.field, table) | {"palette": palette()} | sparse_points(inputs)
+    mesh, of_mesh = small_mesh(inputs)
+    parts |= of_mesh
     header = {
         "field": description(renderer.field, table)
         | gains_of(new_view_effects(field))
@@ -90,6 +93,7 @@ def load(config: "Config", inputs: Inputs, progress: Progress) -> Contents:
         "appearance": new_view_words(field),
         "comparison": comparison._asdict(),
         "inverse_depth": _inverse_depths(renderer, scene),
+        "mesh": mesh,
         "views": [view_header(scene, view, field) for view in scene.views],
     }
     if config.photos == "on":
@@ -223,6 +227,20 @@ def sparse_points(inputs: Inputs) -> dict[str, bytes]:
     chosen = spread(len(points["xyz"]), min(MAX_POINTS, len(points["xyz"])))
     xyz, rgb = points["xyz"][chosen].astype(np.float32), points["rgb"][chosen].astype(np.uint8)
     return {"points_xyz": xyz.tobytes(), "points_rgb": rgb.tobytes()}
+
+
+def small_mesh(inputs: Inputs) -> tuple[dict[str, Any] | None, dict[str, bytes]]:
+    """What stage mesh left for pages, and the sphere in which its positions are given; None without one."""
+    file = inputs["mesh"] / SMALL_COPY if "mesh" in inputs else None
+    if file is None or not file.exists():
+        return None, {}
+    small = read_tensors(file)
+    header = {
+        "middle": small["middle"].tolist(),
+        "radius": float(small["radius"][0]),
+        "faces": len(small["faces"]),
+    }
+    return header, {f"mesh_{name}": small[name].tobytes() for name in ("positions", "faces", "colours")}
 
 
 def photo_side(count: int) -> int:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 FILES = Path(__file__).with_name("page")
 SHADERS = ("space", "field", "march", "overlay")
 SCRIPTS = ("geometry", "contents", "graphics", "renderer", "overlay", "navigation", "path", "panels", "main")
+NO_NETWORK, OWN_SERVER = 'img-src data: blob:">', "img-src data: blob:; connect-src 'self'\">"  # ends of page policies
 ALIGNMENT = 8  # of a section, for typed arrays
 
 
@@ -63,6 +64,14 @@ def page(kind: Literal["still", "not drawn", "live"], payload: str = "") -> str:
     shaders = json.dumps({name: _text(f"shaders/{name}.glsl") for name in SHADERS})
     script = "\n".join([f"const SHADERS = {shaders};", *(_text(f"{name}.js") for name in scripts)])
     return environment.get_template("page.html.j2").render(**parts, script=Markup(script))
+
+
+def watching(text: str) -> str:
+    """A page of a finished training, as a server hands it out: another training that has begun takes its place."""
+    if text.count(NO_NETWORK) != 1:  # made by another version, whose policy would forbid to ask
+        return text
+    script = f'<script id="watch">\n"use strict";\n{_text("watch.js")}</script>\n</head>'
+    return text.replace(NO_NETWORK, OWN_SERVER).replace("</head>", script, 1)
 
 
 def _text(name: str) -> str:

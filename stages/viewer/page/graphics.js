@@ -1,20 +1,22 @@
 // All of WebGL that holds the field: programs, textures, uniform blocks. Made anew when a lost context comes back.
 
 const TEXTURE_WIDTH = 2048; // as in field.glsl
-const VIEWS = { colour: 0, depth: 1, normals: 2, opacity: 3, distance: 4, cost: 5 };
+const VIEWS = { colour: 0, depth: 1, normals: 2, opacity: 3, cost: 4 };
 const MAX_STEPS = 8192; // of a ray, empty ones included; hops over empty bricks keep real rays far below
 const BLOCKS = ["DensityNetwork", "ColourNetwork"];
 
 class Graphics {
   constructor(canvas, contents) {
-    this.gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: false });
+    this.gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: true, preserveDrawingBuffer: false });
     if (!this.gl) throw new Error("no WebGL2");
     const { gl } = this, { field } = contents;
     this.field = this.program(
       "out vec2 at;\nvoid main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }",
       [defines(field), SHADERS.space, SHADERS.field, SHADERS.march].join("\n"));
     this.quad = this.program("#define VERTEX\n#define QUAD\n" + SHADERS.overlay, "#define QUAD\n" + SHADERS.overlay);
-    this.drawing = this.program("#define VERTEX\n" + SHADERS.overlay, SHADERS.overlay);
+    this.copying = this.program("#define VERTEX\n#define QUAD\n" + SHADERS.overlay, "#define QUAD\n#define COPY\n" + SHADERS.overlay);
+    const margins = `#define RELATIVE_MARGIN ${RELATIVE_MARGIN}\n#define MARGIN ${MARGIN}\n`;
+    this.drawing = this.program("#define VERTEX\n" + SHADERS.overlay, margins + SHADERS.overlay);
     this.load(contents);
   }
 
@@ -98,20 +100,26 @@ class Graphics {
     }
   }
 
-  /** A picture to draw into: a texture and its framebuffer. */
+  /** A picture to draw into: its colours and the distances of its surface as textures, and their framebuffer. */
   target(width, height) {
-    const { gl } = this, texture = gl.createTexture(), framebuffer = gl.createFramebuffer();
-    gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA8, width, height);
-    for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.LINEAR);
-    for (const wrap of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, wrap, gl.CLAMP_TO_EDGE);
+    const { gl } = this, framebuffer = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
-    return { texture, framebuffer, width, height };
+    const [texture, distances] = [[gl.RGBA8, gl.LINEAR], [gl.R32UI, gl.NEAREST]].map(([format, filter], index) => {
+      const made = gl.createTexture();
+      gl.bindTexture(gl.TEXTURE_2D, made);
+      gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+      for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, filter);
+      for (const wrap of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, wrap, gl.CLAMP_TO_EDGE);
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + index, gl.TEXTURE_2D, made, 0);
+      return made;
+    });
+    gl.drawBuffers([gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1]);
+    return { texture, distances, framebuffer, width, height };
   }
 
   free(target) {
     this.gl.deleteTexture(target.texture);
+    this.gl.deleteTexture(target.distances);
     this.gl.deleteFramebuffer(target.framebuffer);
   }
 
@@ -161,17 +169,33 @@ class Graphics {
   /** Copies a picture into another of any size. */
   copy(from, to) {
     const { gl } = this;
-    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, from.framebuffer);
-    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, to.framebuffer);
-    gl.blitFramebuffer(0, 0, from.width, from.height, 0, 0, to.width, to.height, gl.COLOR_BUFFER_BIT, gl.LINEAR);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, to.framebuffer);
+    gl.viewport(0, 0, to.width, to.height);
+    gl.useProgram(this.copying.program); // blitFramebuffer of the two attachments leaves stripes in SwiftShader
+    gl.uniform1i(this.copying.at("surfaces"), 1);
+    gl.activeTexture(gl.TEXTURE1);
+    gl.bindTexture(gl.TEXTURE_2D, from.distances);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, from.texture);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  /** The bytes of a picture or of a part of it, rows from the bottom. */
-  read(target, x = 0, y = 0, width = target.width, height = target.height) {
-    const { gl } = this, bytes = new Uint8Array(4 * width * height);
+  /** The bytes of a picture, rows from the bottom. */
+  read(target) {
+    const { gl } = this, bytes = new Uint8Array(4 * target.width * target.height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
-    gl.readPixels(x, y, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    gl.readPixels(0, 0, target.width, target.height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
     return bytes;
+  }
+
+  /** The distance of the surface that the first pixel shows; infinite in empty space. */
+  readDistance(target) {
+    const { gl } = this, word = new Uint32Array(4);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
+    gl.readBuffer(gl.COLOR_ATTACHMENT1);
+    gl.readPixels(0, 0, 1, 1, gl.RGBA_INTEGER, gl.UNSIGNED_INT, word);
+    gl.readBuffer(gl.COLOR_ATTACHMENT0);
+    return new Float32Array(word.buffer)[0];
   }
 }
 

@@ -11,7 +11,7 @@ class Viewer {
     this.navigation = new Navigation(canvas, contents.scene.up, (kind) => this.moved(kind), (x, y) => this.clicked(x, y));
     this.navigation.pose = this.home();
     this.overlay = new Overlay(contents);
-    this.renderer = new Renderer(canvas, contents, () => this.request(), (request) => this.drawOver(request));
+    this.renderer = new Renderer(canvas, contents, () => this.request(), (request, target) => this.drawOver(request, target));
     this.overlay.restore(this.renderer.graphics);
     this.readLink();
     this.panels = new Panels(this);
@@ -90,13 +90,12 @@ class Viewer {
     this.panels?.update();
   }
 
-  drawOver(request) {
-    const extras = [];
-    if (this.crop) extras.push(...boxLines(this.crop, COLOURS.crop));
-    if (this.measured.length === 2) extras.push([...this.measured, COLOURS.measure]);
+  drawOver(request, target) {
+    const lines = this.crop ? boxLines(this.crop, COLOURS.crop) : [];
+    const above = this.measured.length === 2 ? [[...this.measured, COLOURS.measure]] : [];
     const { keys } = this.path;
-    keys.slice(1).forEach((key, i) => extras.push([keys[i].centre, key.centre, COLOURS.path]));
-    this.overlay.draw(request, extras, this.photo);
+    keys.slice(1).forEach((key, i) => lines.push([keys[i].centre, key.centre, COLOURS.path]));
+    this.overlay.draw(request, target, { lines, above }, this.photo);
     this.panels?.place(request);
   }
 
@@ -129,14 +128,20 @@ class Viewer {
     if (this.isMeasuring) return this.measure(x, y);
     if (!this.overlay.layers.cameras) return;
     const lens = fitted(this.lens, this.canvas.width, this.canvas.height), reach = 24 * (window.devicePixelRatio || 1);
-    let nearest = null;
-    this.contents.views.forEach((view, index) => {
-      for (const point of [view.pose.centre, ...this.overlay.frustum(view)]) {
-        const at = projected(this.navigation.pose, lens, point), away = Math.hypot(at.x - x, at.y - y);
-        if (at.depth > 0 && away < reach && (!nearest || away < nearest.away)) nearest = { index, away };
-      }
-    });
-    if (nearest) return this.showPhoto(nearest.index);
+    const { pose } = this.navigation;
+    const near = this.contents.views.flatMap((view, index) =>
+      [view.pose.centre, ...this.overlay.frustum(view)].map((point) => ({ index, point, ...projected(pose, lens, point) })));
+    const within = near.map((each) => ({ ...each, away: Math.hypot(each.x - x, each.y - y) }))
+      .filter((each) => each.depth > 0 && each.away < reach)
+      .sort((a, b) => a.away - b.away);
+    const seen = within.find((each) => !this.isHidden(each));
+    if (seen) return this.showPhoto(seen.index);
+  }
+
+  /** Whether the field's surface lies in front of a point that is seen at pixel (x, y), as in overlay.glsl. */
+  isHidden({ point, x, y }) {
+    const surface = this.renderer.distanceAt(x, y) ?? Infinity;
+    return norm(subtract(point, this.navigation.pose.centre)) > surface * (1 + RELATIVE_MARGIN) + MARGIN;
   }
 
   /** The point of the scene that a pixel of the canvas shows; null in empty space. */

@@ -1,15 +1,20 @@
-// What lies over the picture: cameras, sparse points, the crop box, axes, the measured line. Nothing hides it.
+// The layers over the picture: cameras, sparse points, the mesh, the crop box, axes. The picture's surface hides what lies
+// behind it; the measured line alone is always seen.
 
 const COLOURS = {
-  train: [0.35, 0.65, 1], validation: [0.35, 0.65, 1], test: [1, 0.65, 0.2], chosen: [1, 1, 1],
+  train: [0.35, 0.65, 1], validation: [0.35, 0.65, 1], test: [1, 0.65, 0.2],
   crop: [1, 0.9, 0.3], measure: [1, 0.25, 0.55], path: [0.4, 0.95, 0.5],
 };
 const AXES = [[[1, 0, 0], [0.95, 0.3, 0.3]], [[0, 1, 0], [0.35, 0.8, 0.35]], [[0, 0, 1], [0.4, 0.55, 1]]];
 const OVERLAY_NEAR = 0.01; // scene units
+const SHADINGS = { plain: 0, coloured: 1, clay: 2 };
+// A point lies behind a surface that is nearer by more than this, for what lies on the surface is to be seen.
+const RELATIVE_MARGIN = 0.01, MARGIN = 0.015; // of the distance; in scene units
+const MESH_BEHIND = [1, 16]; // polygon offset: points and lines on the mesh stand before it
 
 class Overlay {
   constructor(contents) {
-    Object.assign(this, { contents, layers: { cameras: false, points: false, axes: false } });
+    Object.assign(this, { contents, layers: { cameras: false, points: false, mesh: false, axes: false }, isClay: false });
     const centres = contents.views.map((view) => view.pose.centre);
     const spread = Math.max(...[0, 1, 2].map((axis) => Math.max(...centres.map((c) => c[axis])) - Math.min(...centres.map((c) => c[axis]))));
     this.frustumDepth = clamp(0.04 * spread, 0.01, 0.2);
@@ -17,7 +22,7 @@ class Overlay {
 
   restore(graphics) {
     this.graphics = graphics;
-    this.points = null;
+    this.points = this.mesh = null;
   }
 
   /** The corners of a camera's picture, and where it stands. */
@@ -29,28 +34,58 @@ class Overlay {
     });
   }
 
-  /** Draws over the canvas what `request` shows; `extras` are lines [from, to, colour]. */
-  draw(request, extras, chosen) {
-    const { gl } = this.graphics, { views } = this.contents, lines = [...extras];
-    if (this.layers.cameras) {
-      views.forEach((view, index) => {
-        const corners = this.frustum(view), colour = index === chosen ? COLOURS.chosen : COLOURS[view.split];
-        if (index === chosen) return;
-        corners.forEach((corner, i) => lines.push([corner, corners[(i + 1) % 4], colour], [view.pose.centre, corner, colour]));
-      });
-    }
-    if (this.layers.axes) AXES.forEach(([axis, colour]) => lines.push([[0, 0, 0], scaled(axis, 0.5), colour]));
-    gl.useProgram(this.graphics.drawing.program);
-    const lens = fitted(request.lens, gl.drawingBufferWidth, gl.drawingBufferHeight);
-    gl.uniformMatrix4fv(this.graphics.drawing.at("clipFromScene"), false, clipFromScene(request.pose, lens, OVERLAY_NEAR));
-    gl.uniform1f(this.graphics.drawing.at("pointSize"), 2 * (window.devicePixelRatio || 1));
-    if (this.layers.points) this.drawPoints();
-    if (lines.length) this.drawLines(lines);
+  /** Draws into the canvas, which shows `target`, what `request` shows; `lines` and lines that nothing hides, `above`,
+   *  are [from, to, colour]. The crop box applies to points and mesh: cameras mostly stand outside of it. */
+  draw(request, target, { lines, above }, chosen) {
+    const { gl } = this.graphics, shown = [...lines];
+    if (this.layers.cameras) shown.push(...this.cameraLines(chosen));
+    if (this.layers.axes) AXES.forEach(([axis, colour]) => shown.push([[0, 0, 0], scaled(axis, 0.5), colour]));
+    this.begin(request, target);
+    if (this.layers.mesh) this.drawMesh(request.crop);
+    if (this.layers.points) this.drawPoints(request.crop);
+    if (shown.length) this.drawLines(shown);
+    gl.disable(gl.DEPTH_TEST);
+    if (above.length) this.drawLines(above, false);
   }
 
-  drawLines(lines) {
+  begin(request, target) {
+    const { gl, drawing } = this.graphics, { at } = drawing, [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
+    gl.useProgram(drawing.program);
+    gl.bindTexture(gl.TEXTURE_2D, target.distances);
+    gl.uniformMatrix4fv(at("clipFromScene"), false, clipFromScene(request.pose, fitted(request.lens, width, height), OVERLAY_NEAR));
+    gl.uniform1f(at("pointSize"), 2 * (window.devicePixelRatio || 1));
+    gl.uniform2f(at("size"), width, height);
+    gl.uniform3fv(at("eye"), request.pose.centre);
+    gl.clear(gl.DEPTH_BUFFER_BIT);
+    gl.enable(gl.DEPTH_TEST);
+    gl.depthFunc(gl.LEQUAL);
+  }
+
+  /** How vertices that are drawn next are placed, shaded, hidden and cropped. */
+  set({ middle = [0, 0, 0], radius = 1, shading = "plain", hides = true, crop = null }) {
+    const { gl, drawing: { at } } = this.graphics;
+    gl.uniform4f(at("ball"), ...middle, radius);
+    gl.uniform1i(at("shading"), SHADINGS[shading]);
+    gl.uniform1i(at("hides"), hides ? 1 : 0);
+    gl.uniform1i(at("cropped"), crop ? 1 : 0);
+    if (!crop) return;
+    gl.uniform3fv(at("cropLow"), crop.low);
+    gl.uniform3fv(at("cropHigh"), crop.high);
+  }
+
+  cameraLines(chosen) {
+    return this.contents.views.flatMap((view, index) => {
+      if (index === chosen) return [];
+      const corners = this.frustum(view), colour = COLOURS[view.split];
+      return corners.flatMap((corner, i) => [[corner, corners[(i + 1) % 4], colour], [view.pose.centre, corner, colour]]);
+    });
+  }
+
+  drawLines(lines, hides = true) {
     const { gl } = this.graphics;
-    const array = this.vertices(lines.flatMap(([from, to]) => [...from, ...to]), lines.flatMap(([, , c]) => [...c, ...c]));
+    const positions = new Float32Array(lines.flatMap(([from, to]) => [...from, ...to]));
+    const array = this.vertices(positions, new Float32Array(lines.flatMap(([, , c]) => [...c, ...c])));
+    this.set({ hides });
     gl.bindVertexArray(array.object);
     gl.drawArrays(gl.LINES, 0, 2 * lines.length);
     gl.bindVertexArray(null);
@@ -58,27 +93,47 @@ class Overlay {
     array.buffers.forEach((buffer) => gl.deleteBuffer(buffer));
   }
 
-  drawPoints() {
-    const { gl } = this.graphics, xyz = this.contents.section("points_xyz");
-    this.points ??= this.vertices(floats(xyz), Array.from(this.contents.section("points_rgb"), (c) => c / 255));
+  drawPoints(crop) {
+    const { gl } = this.graphics, { section } = this.contents;
+    this.points ??= this.vertices(floats(section("points_xyz")), section("points_rgb"));
+    this.set({ crop });
     gl.bindVertexArray(this.points.object);
-    gl.drawArrays(gl.POINTS, 0, xyz.byteLength / 12);
+    gl.drawArrays(gl.POINTS, 0, this.points.count);
     gl.bindVertexArray(null);
   }
 
-  vertices(...attributes) {
-    const { gl } = this.graphics, object = gl.createVertexArray();
-    gl.bindVertexArray(object);
-    const buffers = attributes.map((values, index) => {
-      const buffer = gl.createBuffer();
-      gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-      gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(values), gl.STATIC_DRAW);
-      gl.enableVertexAttribArray(index);
-      gl.vertexAttribPointer(index, 3, gl.FLOAT, false, 0, 0);
-      return buffer;
-    });
+  drawMesh(crop) {
+    const { gl } = this.graphics, { section, mesh } = this.contents;
+    const words = (bytes, kind) => new kind(bytes.buffer, bytes.byteOffset, bytes.byteLength / 2);
+    this.mesh ??= this.vertices(words(section("mesh_positions"), Int16Array), section("mesh_colours"), words(section("mesh_faces"), Uint16Array));
+    this.set({ ...mesh, crop, shading: this.isClay ? "clay" : "coloured" });
+    gl.enable(gl.POLYGON_OFFSET_FILL);
+    gl.polygonOffset(...MESH_BEHIND);
+    gl.bindVertexArray(this.mesh.object);
+    gl.drawElements(gl.TRIANGLES, this.mesh.faces.length, gl.UNSIGNED_SHORT, 0);
     gl.bindVertexArray(null);
-    return { object, buffers };
+    gl.disable(gl.POLYGON_OFFSET_FILL);
+  }
+
+  /** Positions and colours of vertices, three numbers each: floats, or integers of which the largest is 1; faces or none. */
+  vertices(positions, colours, faces = null) {
+    const { gl } = this.graphics, object = gl.createVertexArray();
+    const kinds = new Map([[Float32Array, gl.FLOAT], [Int16Array, gl.SHORT], [Uint8Array, gl.UNSIGNED_BYTE]]);
+    const buffers = [];
+    const filled = (kind, values) => {
+      buffers.push(gl.createBuffer());
+      gl.bindBuffer(kind, buffers.at(-1));
+      gl.bufferData(kind, values, gl.STATIC_DRAW);
+    };
+    gl.bindVertexArray(object);
+    [positions, colours].forEach((values, index) => {
+      filled(gl.ARRAY_BUFFER, values);
+      gl.enableVertexAttribArray(index);
+      gl.vertexAttribPointer(index, 3, kinds.get(values.constructor), true, 0, 0);
+    });
+    if (faces) filled(gl.ELEMENT_ARRAY_BUFFER, faces);
+    gl.bindVertexArray(null);
+    return { object, buffers, faces, count: positions.length / 3 };
   }
 }
 

@@ -62,12 +62,18 @@ class Panels {
 
   layers() {
     const { viewer } = this;
-    for (const name of ["cameras", "points", "axes"]) {
+    for (const name of Object.keys(viewer.overlay.layers)) {
       this.on(`layer-${name}`, "change", (event) => {
         viewer.overlay.layers[name] = event.target.checked;
+        byId("clay-row").hidden = !viewer.overlay.layers.mesh;
         viewer.renderer.showAgain();
       });
     }
+    byId("layer-mesh").disabled = !viewer.contents.mesh;
+    this.on("clay", "change", (event) => {
+      viewer.overlay.isClay = event.target.checked;
+      viewer.renderer.showAgain();
+    });
   }
 
   photos() {
@@ -148,7 +154,7 @@ class Panels {
   }
 
   about() {
-    const { field, comparison, appearance, scene, sections } = this.viewer.contents, list = byId("about");
+    const { field, comparison, appearance, scene, mesh, sections } = this.viewer.contents, list = byId("about");
     const rows = field.levels.reduce((sum, level) => sum + level.rows, 0);
     const bytes = byId("payload")?.textContent.length;
     const facts = {
@@ -161,7 +167,8 @@ class Panels {
       Appearance: appearance ?? "as the photos show it",
       Scale: scene.metres_per_unit ? `a scene unit is ${scene.metres_per_unit.toPrecision(4)} m` : "unknown: lengths are in scene units",
       Photos: sections.photo0 ? `${this.viewer.contents.views.length} small copies are in this file` : "none are in this file",
-      Network: bytes ? "this file never uses any" : "this page asks the server on your own machine, and nobody else",
+      Mesh: mesh ? `${mesh.faces.toLocaleString("en")} faces` : "none is in this file",
+      Network: byId("watch") ? "this page asks the server on your own machine, and nobody else" : bytes ? "this file never uses any" : "this page asks the server on your own machine, and nobody else",
     };
     for (const [name, text] of Object.entries(facts)) {
       for (const [tag, content] of [["dt", name], ["dd", text]]) {
@@ -176,6 +183,7 @@ class Panels {
     if (key >= "1" && key <= "4" && key.length === 1) document.querySelector(`input[name="view"][value="${view}"]`).click();
     if (key === "c") byId("layer-cameras").click();
     if (key === "p") byId("layer-points").click();
+    if (key === "m") byId("layer-mesh").click();
     if (key === "r") this.viewer.reset();
   }
 
@@ -233,14 +241,14 @@ class Panels {
     Object.assign(label.style, { left: `${at.x}px`, top: `${at.y}px` });
   }
 
+  /** What the canvas shows, layers included, once all pixels are there. */
   async screenshot() {
-    const { width, height } = this.viewer.canvas, canvas = Object.assign(document.createElement("canvas"), { width, height });
+    const { canvas, renderer } = this.viewer;
     this.say("Drawing all pixels …");
-    const pixels = await this.viewer.renderer.picture(width, height);
-    for (let i = 3; i < pixels.length; i += 4) pixels[i] = 255;
-    canvas.getContext("2d").putImageData(new ImageData(pixels, width, height), 0, 0);
-    canvas.toBlob((blob) => save(blob, "picture.png"));
+    while (!renderer.isDone) await new Promise(requestAnimationFrame);
     this.say("");
+    renderer.showAgain(); // browsers keep what is drawn only until their own next frame
+    canvas.toBlob((blob) => save(blob, "picture.png"));
   }
 }
 

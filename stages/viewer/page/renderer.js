@@ -11,7 +11,7 @@ const now = () => performance.now();
 
 class Renderer {
   /** `request()` gives what is to be shown: {pose, lens, nearFar, view, background, logGain, falloff, crop}; `over` draws
-   *  on top of it. */
+   *  layers into it. */
   constructor(canvas, contents, request, over) {
     Object.assign(this, { canvas, contents, request, over });
     this.movingPixels = this.stripPixels = MIN_PIXELS;
@@ -122,7 +122,7 @@ class Renderer {
 
   show(target) {
     this.graphics.present(target);
-    this.over(this.shownRequest);
+    this.over(this.shownRequest, target);
     this.presented = target;
   }
 
@@ -161,9 +161,9 @@ class Renderer {
   distanceAt(x, y) {
     const { width, height } = this.canvas, target = this.graphics.target(1, 1), lens = fitted(this.request().lens, width, height);
     const pixel = { width: 1, height: 1, fx: lens.fx, fy: lens.fy, cx: lens.cx - x + 0.5, cy: lens.cy - y + 0.5 };
-    this.graphics.draw(target, { ...this.request(), lens: pixel, view: "distance", opacityStep: OPACITY_STEP });
-    const distance = new DataView(this.graphics.read(target).buffer).getFloat32(0, true);
+    this.graphics.draw(target, { ...this.request(), lens: pixel, opacityStep: OPACITY_STEP });
+    const distance = this.graphics.readDistance(target);
     this.graphics.free(target);
-    return distance > 0 ? distance : null;
+    return Number.isFinite(distance) ? distance : null;
   }
 }

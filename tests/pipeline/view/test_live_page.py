@@ -8,6 +8,11 @@ import numpy as np
 import pytest
 
 from pipeline.engine.run_file import RunFile, write
+from stages import viewer
+from stages.contract import run_stage
+from stages.io.files import write_json
+from stages.train.live import LIVE, STATE
+from tests.conftest import SilentProgress
 from tests.pipeline.view.running_training import KEYS, RunningTraining
 from tests.pipeline.view.test_server import Served
 from tests.stages.viewer.browser import Viewer, chromium
@@ -56,6 +61,32 @@ def test_what_cannot_be_drawn_is_no_end_of_the_server(browser: Any, tmp_path: Pa
         assert page.run("document.getElementById('live-phase').textContent").startswith("Training")
         page.close()
         server.close()
+
+
+def test_a_finished_page_notices_another_training(browser: Any, tmp_path: Path) -> None:
+    with RunningTraining(tmp_path, steps=60) as training:
+        training.wait()
+        train, out = training.workspace.folder("train", KEYS["train"]), tmp_path / "out"
+        out.mkdir()
+        config = viewer.Config(bits="8", mesh="off")
+        run_stage(viewer, config, training.inputs | {"train": train}, out, SilentProgress())
+        training.make_page((out / "viewer.html").read_text("utf-8"))
+    server = Served(training.root)
+    page = Viewer(browser, server.server.url)
+    page.until("window.viewer && !window.follower")
+    page.run("window.before = true")
+    write(training.root, RunFile(keys=KEYS | {"train": "e" * 64}))
+    page.page.wait_for_event("response")
+    page.page.wait_for_event("response")
+    assert page.run("window.before"), "nothing has been trained yet: what is there stays"
+    with training.workspace:
+        live = training.workspace.partial("train", "e" * 64) / LIVE
+        live.mkdir(parents=True)
+        write_json(live / STATE, {"field": "one", "step": 1, "total_steps": 2, "progress": 0.5, "curve": []})
+        page.page.get_by_text("Training · step 1 of 2").wait_for(state="attached")
+        assert not page.run("window.before") and page.faults == []
+    page.close()
+    server.close()
 
 
 def test_it_says_when_its_server_is_gone(browser: Any, tmp_path: Path) -> None:

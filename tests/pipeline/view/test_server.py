@@ -23,6 +23,7 @@ from pipeline import view
 from pipeline.engine.run_file import RunFile, write
 from pipeline.view.server import ViewServer, listening
 from stages.train.live import FINISH, LIVE
+from stages.viewer.page import page, watching
 from tests.pipeline.view.running_training import (
     KEYS,
     RunningTraining,
@@ -185,6 +186,7 @@ def test_tokens_cannot_be_guessed(tmp_path: Path) -> None:
 
 
 def test_no_other_address_of_this_machine_answers(served: Served) -> None:
+    assert served.server.listener.getsockname()[0] == "127.0.0.1"
     address = can_reach_other_address()
     if address is None:
         pytest.skip("this machine has no address but its own loop's")
@@ -283,6 +285,13 @@ def test_a_finished_page_is_served_where_nothing_runs(tmp_path: Path) -> None:
     assert (told["phase"], told["field"]) == ("stopped", None), "a field of another scene"
     assert server.server.served_last == math.inf and b"follow();" in server.ask("").body
     server.close()
+
+
+def test_only_a_page_of_this_version_is_made_to_ask() -> None:
+    whole = page("still", "")
+    served = watching(whole)
+    assert served.count("connect-src 'self'") == 1 and served.count('<script id="watch">') == 1
+    assert "connect-src" not in whole and watching("<head></head>") == "<head></head>"
 
 
 def test_ctrl_c_ends_the_command_and_leaves_the_training_alone(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ from nerf.kernels.torch.occupancy import cell_corners
 from nerf.runtime.randomness import generator
 from stages.hardware.backend import load_backend
 from stages.io.field_files import save_field
-from stages.io.files import write_json
+from stages.io.files import write_json, write_tensors
+from stages.mesh.preview import SMALL_COPY
 from tests.stages.photo_scene import photographed, pose_towards_origin
 
 CELLS = 16
@@ -44,13 +45,27 @@ def made(folder: Path, space: str, view_dependence: bool = True, **info: Any) ->
     alpha = space == "box"
     inputs, scene = photographed(folder, channels=4 if alpha else 3, bounded=alpha)
     field = random_field(SPACES[space], not alpha, view_dependence)
-    for name in ("train", "scale"):
+    for name in ("train", "scale", "mesh"):
         (folder / name).mkdir()
         inputs[name] = folder / name
     write_json(inputs["scale"] / "scale.json", {"metres_per_unit": None})
+    write_tensors(inputs["mesh"] / SMALL_COPY, octahedron())
     background = [1.0, 1.0, 1.0] if alpha else [0.0, 0.0, 0.0]
     save_field(inputs["train"], field, {"background": background, "downscale": 1.0, "effects": {}} | info)
     return Made(inputs, scene, field)
+
+
+def octahedron() -> dict[str, np.ndarray]:
+    """As stage mesh leaves its copy for pages: a red one around the middle, 0.4 to its corners."""
+    corners = np.concatenate([np.eye(3), -np.eye(3)]) * 32767
+    faces = [[a, b, c] for a in (0, 3) for b in (1, 4) for c in (2, 5)]
+    return {
+        "positions": corners.astype(np.int16),
+        "faces": np.array(faces, np.uint16),
+        "colours": np.tile(np.array([255, 0, 0], np.uint8), (6, 1)),
+        "middle": np.array([0.0, 0.0, 0.1]),
+        "radius": np.array([0.4]),
+    }
 
 
 def renamed(made: Made, names: tuple[str, ...] = NAMES) -> None:

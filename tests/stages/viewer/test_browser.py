@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from nerf.effects.appearance import AppearanceModel
 from nerf.rendering.srgb import linear_light, srgb_values
@@ -251,6 +252,148 @@ def test_the_crop_box_leaves_nothing_outside(ball: Viewer):
     ball.run("viewer.crop = {low: [0.8, 0.8, 0.8], high: [0.9, 0.9, 0.9]}; viewer.changed()")
     assert np.ptp(before) > 50 and np.ptp(ball.shown().reshape(-1, 4)[:, :3]) == 0
     ball.run("viewer.crop = null; viewer.changed()")
+
+
+LAYER = """([shares]) => {
+  const { canvas, navigation: { pose }, overlay, renderer } = viewer, { gl } = renderer.graphics;
+  const lens = fitted(viewer.lens, canvas.width, canvas.height), marks = [];
+  for (let y = 33.5; y < 57; y += 2) for (let x = 48.5; x < 72; x += 2) {
+    const surface = renderer.distanceAt(x, y), share = shares[marks.length % shares.length];
+    const point = add(pose.centre, scaled(pixelDirection(pose, lens, x, y), share * (surface ?? 3)));
+    marks.push({ x, y, share, solid: surface !== null, point });
+  }
+  overlay.points = overlay.vertices(new Float32Array(marks.flatMap(({ point }) => point)),
+    new Float32Array(marks.flatMap(() => [1, 0, 1])));
+  overlay.layers.points = true;
+  renderer.showAgain();
+  const pixel = new Uint8Array(4);
+  for (const mark of marks) {
+    gl.readPixels(mark.x - 0.5, canvas.height - mark.y - 0.5, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+    mark.seen = pixel[0] === 255 && pixel[1] === 0 && pixel[2] === 255;
+  }
+  overlay.layers.points = false;
+  overlay.points = null;
+  renderer.showAgain();
+  return marks;
+}"""
+
+
+def test_the_surface_hides_points_behind_it(ball: Viewer):
+    """Some stand before what the pixel shows, some behind; in empty space nothing hides them."""
+    ball.done()
+    marks = ball.run(LAYER, [[0.9, 1.2]])
+    seen = {(each["solid"], each["share"]): [] for each in marks}
+    for each in marks:
+        seen[each["solid"], each["share"]].append(each["seen"])
+    assert all(len(flags) > 5 for flags in seen.values()) and len(seen) == 4
+    assert all(seen[True, 0.9]) and not any(seen[True, 1.2])
+    assert all(seen[False, 0.9]) and all(seen[False, 1.2])
+
+
+def test_the_crop_box_applies_to_points(ball: Viewer):
+    ball.done()
+    points = np.array([each["point"] for each in ball.run(LAYER, [[0.9]])])
+    axis, high = int(np.ptp(points, axis=0).argmax()), [9.0, 9.0, 9.0]
+    high[axis] = float(np.median(points[:, axis]))
+    ball.run("(high) => { viewer.crop = {low: [-9, -9, -9], high}; viewer.changed(); }", high)
+    ball.done()
+    marks = [(each["point"][axis] - high[axis], each["seen"]) for each in ball.run(LAYER, [[0.9]])]
+    inside, outside = [seen for at, seen in marks if at < -0.02], [seen for at, seen in marks if at > 0.02]
+    assert len(inside) > 5 and len(outside) > 5 and all(inside) and not any(outside)
+    ball.run("viewer.crop = null; viewer.changed()")
+
+
+PLANE = """(depth) => {
+  const { canvas, contents, navigation: { pose }, overlay, renderer } = viewer, { gl } = renderer.graphics;
+  const lens = fitted(viewer.lens, canvas.width, canvas.height), most = 32767, marks = [], before = contents.mesh;
+  const corners = [[-1, -1], [1, -1], [-1, 1], [1, 1]].flatMap(([a, b]) =>
+    add(scaled(right(pose), a * most), scaled(down(pose), b * most)).map((v) => v / 2));
+  contents.mesh = { middle: add(pose.centre, scaled(forward(pose), depth)), radius: 20, faces: 2 };
+  const colours = Uint8Array.from({ length: 12 }, (_, i) => (i % 3 === 1 ? 0 : 255)), pixel = new Uint8Array(4);
+  overlay.mesh = overlay.vertices(new Int16Array(corners), colours, new Uint16Array([0, 1, 2, 2, 1, 3]));
+  overlay.layers.mesh = true;
+  renderer.showAgain();
+  for (let y = 33.5; y < 57; y += 2) for (let x = 48.5; x < 72; x += 2) {
+    gl.readPixels(x - 0.5, canvas.height - y - 0.5, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+    marks.push({ x, y, seen: pixel[0] > 180 && pixel[1] === 0 && pixel[2] > 180 });
+  }
+  for (const mark of marks) {
+    mark.surface = renderer.distanceAt(mark.x, mark.y);
+    mark.plane = depth / dot(pixelDirection(pose, lens, mark.x, mark.y), forward(pose));
+  }
+  [contents.mesh, overlay.mesh, overlay.layers.mesh] = [before, null, false];
+  renderer.showAgain();
+  return marks;
+}"""
+
+
+def test_the_surface_hides_the_mesh_behind_it(ball: Viewer):
+    """A plane through the scene, against the distances that the field's picture has."""
+    ball.done()
+    seen, hidden = [], []
+    for each in ball.run(PLANE, 3.5):
+        surface = each["surface"] or np.inf
+        if each["plane"] < 0.99 * surface:
+            seen.append(each["seen"])
+        elif each["plane"] > 1.03 * surface:
+            hidden.append(each["seen"])
+    assert len(seen) > 5 and len(hidden) > 5 and all(seen) and not any(hidden)
+
+
+def test_the_mesh_of_the_run_is_a_layer(ball: Viewer):
+    read = """() => { const { gl } = viewer.renderer.graphics, c = viewer.canvas; viewer.renderer.showAgain();
+      const bytes = new Uint8Array(4 * c.width * c.height);
+      gl.readPixels(0, 0, c.width, c.height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+      let red = 0;
+      for (let i = 0; i < bytes.length; i += 4) red += bytes[i] > 150 && bytes[i + 1] + bytes[i + 2] === 0;
+      return red; }"""
+    ball.run("(crop) => { viewer.crop = crop; viewer.changed(); }", {"low": [0.8] * 3, "high": [0.9] * 3})
+    ball.page.locator("#canvas").press("m")
+    ball.done()
+    assert ball.run(read) == 0, "it lies outside of the box"
+    ball.run("viewer.crop = null; viewer.changed()")
+    ball.done()
+    assert ball.run(read) > 100
+    ball.page.locator("#canvas").press("m")
+    assert ball.run(read) == 0
+
+
+def test_a_saved_picture_is_what_is_shown_with_its_layers(ball: Viewer, tmp_path: Path):
+    plain = ball.shown().reshape(90, 120, 4)[..., :3]
+    pictures = []
+    for _ in ("without the mesh", "with it"):
+        with ball.page.expect_download() as download:
+            ball.run("document.getElementById('screenshot').click()")
+        download.value.save_as(tmp_path / "picture.png")
+        with Image.open(tmp_path / "picture.png") as opened:
+            pictures.append(np.asarray(opened.convert("RGB"), float))
+        ball.page.locator("#canvas").press("m")
+    assert np.abs(pictures[0] - plain).max() <= 1
+    red = (pictures[1][..., 0] > 150) & (pictures[1][..., 1:].sum(axis=-1) == 0)
+    assert 100 < red.sum() < 5000 and np.abs(pictures[1] - plain)[~red].max() <= 1
+
+
+def test_a_camera_behind_the_surface_is_not_clicked(ball: Viewer):
+    """A camera that stands on the ray of a pixel, before the surface that this shows and behind it."""
+    click = """(share) => {
+      const { canvas, contents, navigation: { pose }, overlay } = viewer, { views } = contents;
+      const lens = fitted(viewer.lens, canvas.width, canvas.height), y = 45.5;
+      let x = 48.5;
+      while (viewer.renderer.distanceAt(x, y) === null) ++x;
+      const away = scaled(pixelDirection(pose, lens, x, y), share * viewer.renderer.distanceAt(x, y));
+      contents.views = [{ ...views[0], pose: { ...views[0].pose, centre: add(pose.centre, away) } }];
+      let clicked = null;
+      const depth = overlay.frustumDepth;
+      overlay.frustumDepth = 1e-3; // no corner looks out from behind
+      viewer.showPhoto = (index) => (clicked = index);
+      overlay.layers.cameras = true;
+      viewer.clicked(x, y);
+      overlay.layers.cameras = false;
+      delete viewer.showPhoto;
+      [contents.views, overlay.frustumDepth] = [views, depth];
+      return clicked;
+    }"""
+    assert ball.run(click, 0.8) == 0 and ball.run(click, 1.3) is None
 
 
 def test_a_lost_context_comes_back(ball: Viewer):

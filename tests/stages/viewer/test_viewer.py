@@ -112,6 +112,17 @@ def test_without_photos_none_is_in_the_file(tmp_path: Path):
     assert [name for name in parts if name.startswith("photo")] == [] and "table" in parts
 
 
+def test_the_mesh_is_in_the_file_unless_told_otherwise(tmp_path: Path):
+    field = made(tmp_path, "box")
+    _, header, parts = page_of(field, tmp_path / "page")
+    assert header["mesh"] == {"middle": [0.0, 0.0, 0.1], "radius": pytest.approx(0.4), "faces": 8}
+    assert [len(parts[f"mesh_{name}"]) for name in ("positions", "faces", "colours")] == [36, 48, 18]
+    assert viewer.more_inputs(viewer.Config()) == ("mesh",) and viewer.more_inputs(viewer.Config(mesh="off")) == ()
+    del field.inputs["mesh"]
+    _, header, parts = page_of(field, tmp_path / "without", mesh="off")
+    assert header["mesh"] is None and not any(name.startswith("mesh") for name in parts)
+
+
 def test_8_bits_that_lose_too_much_become_16(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     field = made(tmp_path, "box")
     assert page_of(field, tmp_path / "a")[1]["field"]["bits"] == 8

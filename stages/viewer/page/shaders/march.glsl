@@ -3,7 +3,8 @@
 
 const float EARLY_STOP_TRANSMITTANCE = 1e-3;
 const float OPAQUE = 800.0;
-const int COLOUR = 0, DEPTH = 1, NORMALS = 2, OPACITY = 3, DISTANCE = 4, COST = 5; // views
+const int COLOUR = 0, DEPTH = 1, NORMALS = 2, OPACITY = 3, COST = 4; // views
+const uint INFINITE = 0x7f800000u; // bits of a float
 
 uniform int view;
 uniform vec2 size; // of the picture, in pixels
@@ -21,7 +22,8 @@ uniform vec3 logGain; // of the exposure shown, natural logarithms in linear lig
 uniform vec4 falloff; // of a photo's vignetting: three coefficients, 1 / (4 sin²(θ/2)) of the corner
 uniform vec2 inverseDepthRange; // that the view of depth shows
 uniform highp sampler2D palette;
-out vec4 shown;
+layout(location = 0) out vec4 shown;
+layout(location = 1) out uint surface; // bits of the distance at which half of the light is stopped
 
 bool isOccupied(ivec3 cell, out float emptyDistance) {
     ivec3 brick = cell >> 2;
@@ -137,10 +139,7 @@ void main() {
     float transmittance = exp(-seen.depth);
     float opacity = 1.0 - transmittance;
     if (seen.accumulated > 0.0) seen.rendered *= opacity / seen.accumulated;
-    if (view == DISTANCE) {
-        shown = bytesOf(floatBitsToUint(seen.median < ray.far ? seen.median : -1.0));
-        return;
-    }
+    surface = seen.median < ray.far ? floatBitsToUint(seen.median) : INFINITE;
     if (view == COST) {
         shown = bytesOf(uint(seen.samples) | (uint(seen.colours) << 16));
         return;
