@@ -110,6 +110,10 @@ class StageError(Exception):
         self.what, self.why, self.hint = (bounded(part) for part in (what, why, hint))
         super().__init__(f"{self.what}: {self.why}. {self.hint}")
 
+    def __reduce__(self) -> tuple[type[Self], tuple[str, str, str, str]]:
+        """As it travels between processes."""
+        return type(self), (self.code, self.what, self.why, self.hint)
+
 
 def bounded(text: str, most: int = MAX_LETTERS) -> str:
     """At most so many letters of it."""

@@ -23,7 +23,7 @@ torch.set_num_threads(1)
 settings.register_profile("default", deadline=None)
 settings.load_profile("default")
 
-pytest_plugins = ["tests.synthetic_photos"]
+pytest_plugins = ["tests.ray_cluster", "tests.synthetic_photos"]
 
 
 @pytest.fixture(scope="session")

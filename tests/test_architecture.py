@@ -43,7 +43,7 @@ ALLOWED_BASES = {"Module", "Function", "Exception", "BaseException", "Enum", "In
 SLOW = {
     *("torch", "warp", "pycolmap", "kornia", "cv2", "trimesh", "skimage", "scipy", "matplotlib", "PIL", "pillow_heif"),
     *("numpy", "jaxtyping", "safetensors", "jinja2", "rich", "fast_simplification", "imageio_ffmpeg"),
-    *("starlette", "uvicorn"),
+    *("starlette", "uvicorn", "ray"),
 }
 ONLY_ON_UNIX = {"resource", "fcntl", "termios"}
 LATE = {

@@ -62,6 +62,15 @@ class Common:
     """Choose again what was chosen automatically, for every stage of a run or for the one that is named."""
     verify: bool = False
     """Check the sha256 of every file of finished results, and rebuild what is damaged."""
+    cluster: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="auto|HOST:PORT",
+            help="Share independent work with the machines of a Ray cluster; auto: the one of this machine (default: "
+            "this machine alone).",
+            help_behavior_hint="",
+        ),
+    ] = None
 
 
 @dataclass

@@ -37,6 +37,7 @@ from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace
 from pipeline.view import check_installed, open_browser, serve_during
 from stages.contract import StageError
+from stages.hardware import cluster
 from stages.hardware.ranks import launched
 from stages.io.amounts import duration
 
@@ -278,14 +279,16 @@ def _run_stages(
     if "evaluate" in stages:
         check_fitted_poses(settings)
     settings = with_lasting_cameras(settings, root)
-    with Workspace(root) as workspace:
+    if common.cluster is not None:
+        root = root.absolute()  # machines of a cluster work in folders of their own
+    with Workspace(root) as workspace, cluster.joined(common.cluster, [root]):
         runner = Runner(workspace, settings, display)
         if new_budget is not None:
             runner.set_budget(*new_budget)
         replan = (stages if alone is None else (alone,)) if common.replan else ()
         again = force | (runner.run_file.plans.keys() & replan)
         forecast = runner.forecast(stages, again)
-        display.headline(" · ".join([machine.headline(root), *forecast.messages]))
+        display.headline(" · ".join([machine.headline(root), *cluster.described(), *forecast.messages]))
         try:
             given = {"force": force, "replan": replan, "remember": alone is None, "verify": common.verify}
             ran = runner.run(stages, times=forecast.times, **given)

@@ -6,9 +6,9 @@ there. Both appear whole or not at all, so a run that was killed continues where
 
 import shutil
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from stages.depth.matching import MAX_VOLUME_BYTES, candidates, cost_volume_byte
 from stages.depth.photos import KEPT_PHOTOS, TrainingPhotos, one_thread_each, read_training_photos
 from stages.depth.point_cloud import ReadMap, fuse, ply_bytes
 from stages.depth.rectification import Rectified
+from stages.hardware.cluster import fan_out
 from stages.hardware.memory import check_memory
 from stages.io.amounts import short_count
 from stages.io.files import write_durably, write_json
@@ -78,14 +79,13 @@ def match_pairs(photos: TrainingPhotos, pairs: Pairs, folder: Path, progress: Pr
             del waiting[number]
         elif not waiting[number]:
             _write_agreed(photos, number, [], folder)
-    to_do = [pair for pair in pairs if waiting.keys() & set(pair)]
-
-    def compute(pair: tuple[int, int]) -> tuple[int, int]:
-        _match(photos, pair, pairs[pair], [number for number in pair if number in waiting_at_first], folder)
-        return pair
-
-    waiting_at_first = frozenset(waiting)
-    for done, pair in enumerate(in_order(compute, to_do, CPU), 1):
+    to_do = [
+        _PairToMatch(pair, geometry, tuple(number for number in pair if number in waiting))
+        for pair, geometry in pairs.items()
+        if waiting.keys() & set(pair)
+    ]
+    here = partial(in_order, device=CPU)
+    for done, pair in enumerate(fan_out(partial(_match, photos, folder), to_do, here), 1):
         for number, other in (pair, pair[::-1]):
             if number in waiting:
                 waiting[number].discard(other)
@@ -105,17 +105,27 @@ def _neighbours(number: int, pairs: Pairs) -> list[int]:
     return sorted({one for pair in pairs if number in pair for one in pair} - {number})
 
 
-def _match(photos: TrainingPhotos, pair: tuple[int, int], geometry: Rectified, wanted: list[int], folder: Path) -> None:
-    """Write what a pair says of the photos ``wanted`` of it, unless that is there."""
-    missing = [n for n in wanted if not _side_file(folder, n, pair[0] + pair[1] - n).exists()]
+class _PairToMatch(NamedTuple):
+    """Two photos, their rectified geometry, and which of them depth is ``wanted`` of."""
+
+    pair: tuple[int, int]
+    geometry: Rectified
+    wanted: tuple[int, ...]
+
+
+def _match(photos: TrainingPhotos, folder: Path, task: _PairToMatch) -> tuple[int, int]:
+    """Write what a pair says of its photos, unless that is there; the pair."""
+    one, other = task.pair
+    missing = [n for n in task.wanted if not _side_file(folder, n, one + other - n).exists()]
     if not missing:
-        return
-    one, other = pair
+        return task.pair
     viewpoints = photos.viewpoints[one], photos.viewpoints[other]
-    found = candidates(geometry, viewpoints, (photos.pixels(one), photos.pixels(other)))
+    with one_thread_each():
+        found = candidates(task.geometry, viewpoints, (photos.pixels(one), photos.pixels(other)))
     for number, neighbour, candidate in ((one, other, found[0]), (other, one, found[1])):
         if number in missing:
             write_side(_side_file(folder, number, neighbour), candidate)
+    return task.pair
 
 
 def _side_file(folder: Path, number: int, neighbour: int) -> Path:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -43,6 +43,10 @@ class TrainingPhotos:
     scene: Scene
     points: Mapping[str, np.ndarray]
     downscale: float
+
+    def __getstate__(self) -> dict[str, object]:
+        """As they travel to another process: without what is cached."""
+        return {each.name: self.__dict__[each.name] for each in fields(self)}
 
     @cached_property
     def tracks(self) -> Tracks:

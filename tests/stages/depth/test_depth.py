@@ -15,6 +15,7 @@ from stages import depth
 from stages.contract import Inputs, Photos, StageResult, Workload, plan_stage
 from stages.depth import Config, estimation, files, matching
 from stages.depth.files import depth_map_file, read_depth_map
+from stages.hardware import cluster
 from tests.conftest import SilentProgress
 from tests.refusals import refused
 from tests.stages.depth.walls import WallScene, cameras_before, wall
@@ -74,6 +75,11 @@ def test_it_writes_maps_of_training_photos_and_points(undisturbed) -> None:
 def test_any_number_of_threads_gives_the_same_bytes(inputs, undisturbed, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(parallel, "_taken", 3)
     assert result_of(inputs, tmp_path)[1] == undisturbed[1]
+
+
+def test_a_cluster_gives_the_same_bytes(inputs, undisturbed, tmp_path, ray_cluster) -> None:
+    with cluster.joined(ray_cluster, [tmp_path]):
+        assert result_of(inputs, tmp_path)[1] == undisturbed[1]
 
 
 class Interrupted(SilentProgress):
