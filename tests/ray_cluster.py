@@ -8,7 +8,7 @@ import pytest
 
 RUNNING = "PIPELINE_TEST_CLUSTER"  # HOST:PORT of a cluster to test with in place of a new one
 OBJECT_STORE_BYTES = 10**8
-WITHOUT_RAY = "Ray is not installed: pip install -c constraints.txt 'pipeline-nerf[cluster]'"
+WITHOUT_RAY = "Ray is not installed: pip install -c constraints.txt '.[cluster]'"
 
 
 @pytest.fixture(scope="session")

@@ -29,9 +29,8 @@ START_SECONDS = 30.0  # that the server of `run --view` may take to say where it
 def check_installed() -> None:
     """Raises StageError without the packages that serve."""
     if missing := [name for name in NEEDED if find_spec(name) is None]:
-        hint = (
-            "Install them with `pip install 'pipeline-nerf[view]'`; output/viewer.html of a finished run needs neither."
-        )
+        install = "`pip install -c constraints.txt '.[view]'` in the clone"
+        hint = f"Install them with {install}; output/viewer.html of a finished run needs neither."
         raise StageError(
             "pipeline.view-not-installed", "cannot serve a page", f"not installed: {', '.join(missing)}", hint
         )

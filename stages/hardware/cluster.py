@@ -33,7 +33,7 @@ Result = TypeVar("Result")
 Place = Literal["core", "machine"]
 """What a piece of work takes: one core, or all cores of a machine, with a GPU where the cluster has any."""
 
-INSTALL = 'pip install -c constraints.txt "pipeline-nerf[cluster]"'
+INSTALL = 'pip install -c constraints.txt ".[cluster]" in the clone'
 MAX_RETRIES = 5  # of a piece whose process died; what ends a process each time is given up then
 MAX_WAITING = 16  # results that wait for an earlier one, for each piece under way
 POLL_SECONDS, REACH_SECONDS, LOST_SECONDS, PROBE_SECONDS = 1.0, 10.0, 15.0, 300.0

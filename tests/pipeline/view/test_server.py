@@ -239,7 +239,7 @@ def test_the_browser_is_told_the_address_in_private(tmp_path: Path, monkeypatch:
 
 def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(view, "find_spec", lambda name: None if name == "uvicorn" else object())
-    with refused("pipeline.view-not-installed", "uvicorn", "pipeline-nerf[view]"):
+    with refused("pipeline.view-not-installed", "uvicorn", ".[view]"):
         view.check_installed()
 
 
