@@ -344,9 +344,10 @@ def test_words_for_a_video_that_gives_no_photos(tmp_path: Path, progress: Any, c
     (tmp_path / "text.mp4").write_text("no video at all\n" * 100)
     error = refusal(tmp_path / "text.mp4", tmp_path / "3", progress)
     assert error.code == "ingest.unknown-video" and "ffmpeg -i text.mp4 " in error.hint
-    for content, why in ((b"", "empty"), (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull")):
+    stand_ins = (b"", "empty"), (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull")
+    for number, (content, why) in enumerate(stand_ins):
         (tmp_path / "text.mp4").write_bytes(content)
-        error = refusal(tmp_path / "text.mp4", tmp_path / "4", progress)
+        error = refusal(tmp_path / "text.mp4", tmp_path / f"stand-in-{number}", progress)
         assert error.code == "ingest.no-video" and why in error.why
     assert capfd.readouterr().err == ""
 
