@@ -28,11 +28,12 @@ from stages.sfm.colmap.repair import (
     supported_runs,
     supported_steps,
 )
-from stages.sfm.colmap.thinning import thin_matches
+from stages.sfm.colmap.thinning import MAX_EXIF_RATIO, best_linked, far_apart, thin_matches
 from stages.sfm.job import JobState
 from stages.sfm.matching import capture_sequence, consecutive_pairs
 from stages.sfm.retry_strategies import STRATEGIES, MappingOptions, Strategy
 
+CALIBRATING_PHOTOS = 40
 MIN_PHOTOS_OF_CAMERA = 10  # in a row, for their camera to be taken for that of all
 
 
@@ -73,6 +74,8 @@ def run_mapping(
     if state.thinned:
         matches = state.sibling("thinned")
         hold_focal = thin_matches(database, matches, camera_is_known=camera_is_known) and mapping.hold_focal
+        if hold_focal and strategy.mapping is not None:
+            calibrate_by_few(matches, mapping, state)
     options = incremental_options(seed, mapping, camera_is_known, state.thinned, hold_focal)
     trusted = consecutive_pairs(state) if strategy.matches == "consecutive" else set[tuple[int, int]]()
     if strategy.mapping is None:
@@ -100,6 +103,33 @@ def run_mapping(
             compared["taken"] = found[0] is other
     state.end("mapping")
     return found, checked, compared
+
+
+def calibrate_by_few(matches: Path, mapping: MappingOptions, state: JobState) -> None:
+    """Give the cameras that the best linked photos share the intrinsics of a model of these alone.
+
+    All pairs together know nothing of distortion. Where the camera looks across its path, photo by photo, mapping with
+    a focal length that is a little off bends a straight path, in the end to a circle, and no adjustment of hundreds of
+    photos straightens it. A few photos hardly bend. Focal lengths far from what all pairs tell are not believed.
+    """
+    few = best_linked(matches, CALIBRATING_PHOTOS)
+    options = incremental_options(state.job.seed, mapping, False, state.thinned, True)
+    options.image_names = few
+    found = _map_incrementally(matches, options, state)
+    if not found or 2 * found[0].num_reg_images() < len(few):
+        return
+    told = {camera.camera_id: camera.mean_focal_length() for camera in found[0].cameras.values()}
+    release_focal_lengths(found[0])
+    known = [
+        image_id
+        for image_id in sorted(found[0].reg_image_ids())
+        if not far_apart(
+            told[camera := found[0].image(image_id).camera_id],
+            found[0].camera(camera).mean_focal_length(),
+            MAX_EXIF_RATIO,
+        )
+    ]
+    adopt_cameras(matches, found[0], known)
 
 
 def _map_incrementally(matches: Path, options: Any, state: JobState) -> list[Any]:

@@ -103,12 +103,12 @@ def calibrate_focal_lengths(database: Path) -> bool:
     told = {
         camera: math.sqrt(short * long)
         for camera, short in by_short.items()
-        if (long := by_long.get(camera)) and not _far_apart(short, long, MAX_START_RATIO)
+        if (long := by_long.get(camera)) and not far_apart(short, long, MAX_START_RATIO)
     }
     with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
         for camera in cameras:
             focal_px, known = told.get(camera.camera_id), camera.has_prior_focal_length
-            if focal_px is None or (known and not _far_apart(focal_px, camera.mean_focal_length(), MAX_EXIF_RATIO)):
+            if focal_px is None or (known and not far_apart(focal_px, camera.mean_focal_length(), MAX_EXIF_RATIO)):
                 continue
             set_focal_length(camera, focal_px)
             camera.has_prior_focal_length = True
@@ -133,7 +133,8 @@ def _calibrated(database: Path, factor: float) -> dict[int, float]:
     return {camera.camera_id: camera.mean_focal_length() for camera in cameras if camera.has_prior_focal_length}
 
 
-def _far_apart(one: float, other: float, max_ratio: float) -> bool:
+def far_apart(one: float, other: float, max_ratio: float) -> bool:
+    """Whether two lengths differ by more than a ratio."""
     return not 1 / max_ratio < one / other < max_ratio
 
 
@@ -142,3 +143,24 @@ def set_focal_length(camera: pycolmap.Camera, focal_px: float) -> None:
     params = np.array(camera.params)
     params[camera.focal_length_idxs()] = focal_px
     camera.params = params.tolist()
+
+
+def best_linked(database: Path, count: int) -> list[str]:
+    """The names of so many images that hang together by the most verified matches: the one that has most, then again
+    and again the one that has most with those taken. Fewer where no other is linked with them."""
+    with pycolmap.Database.open(database) as db:
+        names = {image.image_id: image.name for image in db.read_all_images()}
+        pair_ids, inliers = db.read_two_view_geometry_num_inliers()
+    ids = sorted(names)
+    strength = np.zeros((len(ids), len(ids)))
+    for pair_id, matches in zip(pair_ids, inliers, strict=True):
+        first, second = (ids.index(one) for one in pycolmap.pair_id_to_image_pair(pair_id))
+        strength[first, second] = strength[second, first] = matches
+    taken = [int(strength.sum(axis=1).argmax())]
+    while len(taken) < min(count, len(ids)):
+        towards = strength[taken].sum(axis=0)
+        towards[taken] = 0
+        if not towards.any():
+            break
+        taken.append(int(towards.argmax()))
+    return [names[ids[number]] for number in taken]
