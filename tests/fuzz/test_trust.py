@@ -36,7 +36,8 @@ UNPICKLE = {
     "numpy.load",
 }
 UNPICKLE |= {"allow_pickle", "yaml.load", "runpy"}
-SERVES = {"pipeline/view/server.py": {"socket"}}  # at this machine's own address alone
+# At this machine's own address alone; the cluster that --cluster names, from the command line.
+SERVES = {"pipeline/view/server.py": {"socket"}, "stages/hardware/cluster.py": {"socket"}}
 CONNECT = {"socket", "urllib", "http", "requests", "ftplib", "smtplib", "aiohttp", "httpx", "huggingface_hub"}
 
 
@@ -48,7 +49,8 @@ def called_and_imported(path: Path) -> set[str]:
         elif isinstance(node, ast.Import):
             found |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            found.add((node.module or "").split(".")[0])
+            module = node.module or ""
+            found.add(module if module == "urllib.parse" else module.split(".")[0])  # which only reads names
     return found
 
 
