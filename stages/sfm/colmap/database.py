@@ -19,6 +19,7 @@ from jaxtyping import Bool
 from stages.hardware.device import processors
 from stages.hardware.memory import at_once
 from stages.io.photos import Photo, spread
+from stages.sfm.colmap.mapping import MAPPING_MODEL
 from stages.sfm.pairs.feature_matching import IndexedFeatures, index_features, match_descriptors, match_indexed
 from stages.sfm.pairs.image_retrieval import WORDS, Words, photo_similarity, vocabulary
 from stages.sfm.pairs.pair_selection import Pairs, SimilarityMatrix
@@ -31,7 +32,6 @@ RELAXED_RATIO = 0.9
 BLOCK_SIZE = 32  # pairs of photos that are committed at once (progress, resuming)
 FISHEYE_MODEL = "SIMPLE_RADIAL_FISHEYE"
 FISHEYE_ANGLE_DEG = 150.0
-FIRST_MODEL = "SIMPLE_RADIAL"  # of a database for features alone, which ask for no camera
 # Of the maximum: where the median of so many photos has fewer, photos are enlarged (docs/experiments/few_features.md).
 MIN_FEATURES_SHARE, COUNTED_PHOTOS = 0.25, 12
 BYTES_PER_PIXEL = 100  # 77 to 86 measured on photos of 1024 to 3200 pixels
@@ -156,7 +156,7 @@ def extract_features(
         some = [large[place] for place in spread(len(large), min(len(large), COUNTED_PHOTOS))]
         with tempfile.TemporaryDirectory(dir=database.parent) as folder:
             counted = Path(folder, "some.db")
-            fill_database(counted, [photos[number] for number in some], FIRST_MODEL)
+            fill_database(counted, [photos[number] for number in some], MAPPING_MODEL)
             _extract(counted, images, [photos[number] for number in some], extraction)
             yielded = _median_features(counted, len(some))
             if yielded < MIN_FEATURES_SHARE * extraction.max_features:

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from stages.sfm.colmap.correspondences import Correspondences, read_correspondences
 from stages.sfm.colmap.database import FOCAL_GUESS, finish_copy, keep_inliers, unfinished_copy
+from stages.sfm.pairs.match_graph import inlier_matrix
 
 TRACKS_PER_PHOTO = 500  # of mapping: 1,000 take 1.7 times as long and move no camera by more (docs/stages/sfm.md)
 CALIBRATION_STARTS = 0.5, 2.0  # × the guess; where pairs tell the focal length, both lead to the same within 1 %
@@ -149,18 +150,15 @@ def best_linked(database: Path, count: int) -> list[str]:
     """The names of so many images that hang together by the most verified matches: the one that has most, then again
     and again the one that has most with those taken. Fewer where no other is linked with them."""
     with pycolmap.Database.open(database) as db:
-        names = {image.image_id: image.name for image in db.read_all_images()}
+        names = [image.name for image in sorted(db.read_all_images(), key=lambda image: image.image_id)]
         pair_ids, inliers = db.read_two_view_geometry_num_inliers()
-    ids = sorted(names)
-    strength = np.zeros((len(ids), len(ids)))
-    for pair_id, matches in zip(pair_ids, inliers, strict=True):
-        first, second = (ids.index(one) for one in pycolmap.pair_id_to_image_pair(pair_id))
-        strength[first, second] = strength[second, first] = matches
+    pairs = np.array([pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids], int).reshape(-1, 2) - 1
+    strength = np.maximum(inlier_matrix(len(names), pairs, np.array(inliers, int)), 0)  # none where none was tried
     taken = [int(strength.sum(axis=1).argmax())]
-    while len(taken) < min(count, len(ids)):
+    while len(taken) < min(count, len(names)):
         towards = strength[taken].sum(axis=0)
         towards[taken] = 0
         if not towards.any():
             break
         taken.append(int(towards.argmax()))
-    return [names[ids[number]] for number in taken]
+    return [names[number] for number in taken]
