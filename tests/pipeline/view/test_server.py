@@ -246,17 +246,22 @@ def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_two_servers_show_one_training_to_its_end(tmp_path: Path) -> None:
     with RunningTraining(tmp_path) as training:
         one, two = Served(training.root), Served(training.root)
+        shown = []
         for server in (one, two):
             told = server.until(lambda told: told["field"] and len(told["curve"]) > 2)
+            assert told["phase"] == "training" and 0 < told["progress"] < 1 and not told["finishing"]
             assert server.ask(f"field/{told['field']}").status in (200, 204)
+            shown.append(told)
+        assert 2 < shown[0]["step"] <= shown[1]["step"] < shown[1]["total_steps"]
         own = f"http://127.0.0.1:{two.server.port}"
         assert two.ask("finish", "POST", Origin=own).told == {"asked": True}
         one.until(lambda told: told.get("finishing") or told["phase"] == "finished")
         training.wait()
-        for server in (one, two):
+        for server, before in zip((one, two), shown, strict=True):
             told = server.until(lambda told: told["phase"] == "finished")
-            assert told["field"] == "finished" and told["step"] == told["total_steps"] < 100_000
-            assert len(told["curve"]) > 2 and server.ask("field/finished").status == 200
+            assert told["field"] == "finished" and before["step"] < told["step"] == told["total_steps"] < 100_000
+            assert told["curve"][: len(before["curve"])] == before["curve"]
+            assert len(told["curve"]) > len(before["curve"]) and server.ask("field/finished").status == 200
             server.close()
         assert not (training.workspace.folder("train", KEYS["train"]) / LIVE).exists()
 
