@@ -169,9 +169,12 @@ def _photo(view: View, scene: Scene, ingest: Path) -> np.ndarray:
 
 
 def _mirrored(missing: Sequence[Marker], scene: Scene, ingest: Path) -> set[Marker]:
-    """Those of some markers whose mirror images are in the photos."""
-    found = set()
-    for view in scene.views if missing else ():
+    """Those of some markers whose mirror images are in the photos. These are decoded once more for it: a marker that no
+    photo shows is rare, and looking for mirror images takes as long in every photo as looking for markers."""
+    found = set[Marker]()
+    for view in scene.views:
+        if len(found) == len(missing):
+            break
         photo = _photo(view, scene, ingest)
         for dictionary in {marker.dictionary for marker in missing}:
             here = {(dictionary, each.number) for each in find_markers(photo, dictionary, mirrored=True)}
