@@ -59,7 +59,7 @@ def estimate_depth(config: "Config", inputs: Inputs, folder: Path, progress: Pro
     write_durably(folder / "points.ply", ply_bytes(cloud, photos.scene.scene_from_sfm.inverse()))
     facts |= {"pairs": len(pairs), "pairs_left_out": len(left_out), "points": len(cloud.points)}
     neighbours = {
-        photos.views[number].name: _names(photos, _neighbours(number, pairs)) for number in range(len(photos.views))
+        view.name: _names(photos, others) for view, others in zip(photos.views, _neighbours(photos, pairs), strict=True)
     }
     write_json(folder / "depth.json", facts | {"neighbours": neighbours})
     shutil.rmtree(folder / PAIRS)
@@ -73,7 +73,8 @@ def match_pairs(photos: TrainingPhotos, pairs: Pairs, folder: Path, progress: Pr
     """Match what is not there yet, and write the depth map of each photo once all of its pairs are."""
     for name in (FOLDER, PAIRS):
         (folder / name).mkdir(exist_ok=True)
-    waiting = {number: set(_neighbours(number, pairs)) for number in range(len(photos.views))}
+    neighbours = _neighbours(photos, pairs)
+    waiting = {number: set(others) for number, others in enumerate(neighbours)}
     for number in range(len(photos.views)):
         if depth_map_file(folder, photos.views[number].file).exists():
             del waiting[number]
@@ -90,7 +91,7 @@ def match_pairs(photos: TrainingPhotos, pairs: Pairs, folder: Path, progress: Pr
             if number in waiting:
                 waiting[number].discard(other)
                 if not waiting[number]:
-                    _write_agreed(photos, number, _neighbours(number, pairs), folder)
+                    _write_agreed(photos, number, neighbours[number], folder)
                     del waiting[number]
         progress.update(f"matched {done} of {len(to_do)} pairs of photos", MATCHING * done / len(to_do))
 
@@ -100,9 +101,13 @@ def depth_maps(photos: TrainingPhotos, folder: Path) -> ReadMap:
     return lru_cache(KEPT_PHOTOS)(lambda number: read_depth_map(depth_map_file(folder, photos.views[number].file)))
 
 
-def _neighbours(number: int, pairs: Pairs) -> list[int]:
-    """With which photos one is matched."""
-    return sorted({one for pair in pairs if number in pair for one in pair} - {number})
+def _neighbours(photos: TrainingPhotos, pairs: Pairs) -> list[list[int]]:
+    """Of each photo with which others it is matched, in order."""
+    found = [set[int]() for _ in photos.views]
+    for one, other in pairs:
+        found[one].add(other)
+        found[other].add(one)
+    return [sorted(others) for others in found]
 
 
 class _PairToMatch(NamedTuple):
@@ -200,7 +205,7 @@ def _say_left_out(
         (one, other), why = next(iter(left_out.items()))
         first = f"{photos.views[one].name} and {photos.views[other].name}: {why}"
         progress.note("depth.pairs-left-out", f"{len(left_out)} pairs of photos give no depth ({first})")
-    alone = [number for number in range(len(photos.views)) if len(_neighbours(number, pairs)) < 2]
+    alone = [number for number, others in enumerate(_neighbours(photos, pairs)) if len(others) < 2]
     if alone:
         which = listed(_names(photos, alone), 3)
         why = "fewer than two photos show the same surface from a few degrees aside"

@@ -100,8 +100,8 @@ class TrainingPhotos:
         """The sparse points that a photo shows."""
         viewpoint = self.viewpoints[number]
         seen = np.flatnonzero(self.points["view"] == self.scene.indices_of("train")[number])
-        scale = np.array(viewpoint.size) / [viewpoint.camera.width, viewpoint.camera.height]
-        column, row = np.clip((self.points["xy"][seen] * scale).astype(int), 0, np.array(viewpoint.size) - 1).T
+        at = (self.points["xy"][seen] * viewpoint.scale).astype(int)
+        column, row = np.clip(at, 0, np.array(viewpoint.size) - 1).T
         towards = self.points["xyz"][self.points["point"][seen]] - viewpoint.scene_from_camera[:, 3]
         return SparseDepths(row, column, np.linalg.norm(towards, axis=1))
 

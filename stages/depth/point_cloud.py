@@ -109,7 +109,7 @@ def _look_up(
     local = (points - viewpoint.scene_from_camera[:, 3]) @ viewpoint.scene_from_camera[:, :3]
     away = np.linalg.norm(local, axis=1)
     size = np.array(viewpoint.size)
-    at = project(viewpoint.camera, local) * size / [viewpoint.camera.width, viewpoint.camera.height]
+    at = project(viewpoint.camera, local) * viewpoint.scale
     inside = ((at > 0) & (at < size)).all(axis=1) & (local[:, 2] > 0)
     column, row = np.where(inside[:, None], at, 0).astype(int).T
     found = np.where(inside, depth.distance[row, column], 0)

@@ -43,6 +43,11 @@ class Viewpoint(NamedTuple):
         return width, height
 
     @property
+    def scale(self) -> Float[np.ndarray, "2"]:
+        """Pixels of the depth map, across and down, in a pixel of the photo."""
+        return np.array(self.size) / [self.camera.width, self.camera.height]
+
+    @property
     def focal_px(self) -> float:
         """Mean focal length at the size of the depth map."""
         return focal_and_centre(self.camera)[0] * self.size[0] / self.camera.width
@@ -160,22 +165,22 @@ def resampled(pair: Rectified, photo: Viewpoint, pixels: Pixels, window: tuple[i
     local = directions @ (pair.scene_from_rectified.T @ photo.scene_from_camera[:, :3])
     width, height = photo.size
     at = project(photo.camera, local.reshape(-1, 3)).reshape((*local.shape[:2], 2))
-    at = at * [width / photo.camera.width, height / photo.camera.height] - 0.5
+    at = at * photo.scale - 0.5
     inside = ((at > -0.5) & (at < [width - 0.5, height - 0.5])).all(axis=2)  # NaN, behind the camera, is not inside
-    inside &= _comes_back(photo.camera, local, at, (width, height))
+    inside &= _comes_back(photo, local, at)
     x_map, y_map = np.moveaxis(np.where(np.isfinite(at), at, -1).astype(np.float32), 2, 0)
     grey = cv2.remap(pixels.grey, x_map, y_map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     used = cv2.remap(pixels.used.view(np.uint8), x_map, y_map, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     return Pixels(grey, inside & (used > 0))
 
 
-def _comes_back(camera: Camera, local: np.ndarray, at: np.ndarray, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+def _comes_back(photo: Viewpoint, local: np.ndarray, at: np.ndarray) -> Bool[np.ndarray, "h w"]:
     """Where the pixel at which a camera model puts a direction has that direction: beyond their photos, distortions
     fold back into them. Looked at every few pixels."""
     coarse, pixels = local[::CHECKED_STEP, ::CHECKED_STEP], at[::CHECKED_STEP, ::CHECKED_STEP]
-    pixels = (pixels + 0.5) * [camera.width / size[0], camera.height / size[1]]
+    pixels = (pixels + 0.5) / photo.scale
     pixels = np.where(np.isfinite(pixels), pixels, 0.0)
-    back = ray_directions(camera, pixels.reshape(-1, 2)).reshape(coarse.shape)
+    back = ray_directions(photo.camera, pixels.reshape(-1, 2)).reshape(coarse.shape)
     same = np.linalg.norm(back - coarse, axis=2) < SAME_DIRECTION
     rows, columns = (np.arange(count) // CHECKED_STEP for count in local.shape[:2])
     return same[rows[:, None], columns]
