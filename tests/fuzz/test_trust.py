@@ -82,7 +82,7 @@ def test_a_run_opens_no_connection(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(socket, "getaddrinfo", refuse)
     with pytest.raises(AssertionError, match="a connection"):
         socket.create_connection(("127.0.0.1", 9))
-    done = run(write_set(tmp_path / "set", RING[::2]), tmp_path / "w.nerf")
+    done = run(write_set(tmp_path / "set", RING[::2]), tmp_path / "w.nerf", "--train.steps", "100")
     assert done.code == 0, done.events[-1]
 
 

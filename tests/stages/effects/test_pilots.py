@@ -1,5 +1,6 @@
 """Pilots on a synthetic scene: what they compare, and that they compare nothing else."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -29,10 +30,14 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def trial(inputs: dict[str, Path]) -> PilotScene:
-    made = pilot_scene(inputs, read_scene(inputs["normalise"]), SilentDisplay())
-    assert not isinstance(made, str), made
-    return made
+def trial(inputs: dict[str, Path]) -> Iterator[PilotScene]:
+    """A pilot's scene in photos of 60 × 45 pixels, for pilots of few samples."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pilots, "LONG_SIDE", 60)
+        patch.setattr(pilots, "TARGET_SAMPLES", 1 << 11)
+        made = pilot_scene(inputs, read_scene(inputs["normalise"]), SilentDisplay())
+        assert not isinstance(made, str), made
+        yield made
 
 
 def test_photos_are_kept_back_from_the_training_photos_alone(trial: PilotScene, inputs: dict[str, Path]) -> None:
