@@ -51,10 +51,10 @@ def test_a_second_run_does_nothing_and_soon(chain: Chain):
     assert program.events()[-1]["message"].startswith("nothing to do")
 
 
-def test_another_mesh_resolution_runs_only_mesh_and_report(chain: Chain, tmp_path: Path):
+def test_another_mesh_resolution_runs_mesh_viewer_and_report(chain: Chain, tmp_path: Path):
     program = chain.start(copy_workspace(chain.workspace, tmp_path / "w.nerf"), "--mesh.resolution", "20").finish()
     ran = [event["stage"] for event in program.events() if event["event"] == "end" and not event["cached"]]
-    assert ran == ["mesh", "report"]
+    assert ran == ["mesh", "viewer", "report"]
 
 
 def videos_plan(workspace: Path) -> dict[str, Any]:
