@@ -2,6 +2,7 @@
 
 import os
 import threading
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,8 @@ class RunningTraining:
             self._finish("train", self.partial, result, "normalise")
         except BaseException as error:
             self.error = error
+            if not isinstance(error, Over):
+                traceback.print_exc()
 
     def _finish(self, stage: str, partial: Path, result: StageResult, of: str) -> None:
         """As the runner does, of the outputs of one other stage."""

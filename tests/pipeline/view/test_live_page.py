@@ -26,7 +26,7 @@ def browser() -> Iterator[Any]:
 
 def test_it_follows_a_training_to_the_end_it_asks_for(browser: Any, tmp_path: Path) -> None:
     with RunningTraining(tmp_path) as training:
-        server = Served(training.root)
+        server = Served(training)
         page = Viewer(browser, server.server.url)
         page.until("follower.shown")
         first, field = page.drawn(), page.run("follower.shown")
@@ -51,7 +51,7 @@ def test_it_follows_a_training_to_the_end_it_asks_for(browser: Any, tmp_path: Pa
 
 def test_what_cannot_be_drawn_is_no_end_of_the_server(browser: Any, tmp_path: Path) -> None:
     with RunningTraining(tmp_path) as training:
-        server = Served(training.root)
+        server = Served(training)
         page = Viewer(browser, server.server.url)
         page.until("follower.shown")
         page.run("() => { viewer.replace = () => { throw new TypeError('broken'); }; }")
@@ -71,7 +71,7 @@ def test_a_finished_page_notices_another_training(browser: Any, tmp_path: Path) 
         config = viewer.Config(bits="8", mesh="off")
         run_stage(viewer, config, training.inputs | {"train": train}, out, SilentProgress())
         training.make_page((out / "viewer.html").read_text("utf-8"))
-    server = Served(training.root)
+    server = Served(training)
     page = Viewer(browser, server.server.url)
     page.until("window.viewer && !window.follower")
     page.run("window.before = true")
@@ -90,7 +90,7 @@ def test_a_finished_page_notices_another_training(browser: Any, tmp_path: Path) 
 
 
 def test_it_says_when_its_server_is_gone(browser: Any, tmp_path: Path) -> None:
-    server = Served(RunningTraining(tmp_path).root)
+    server = Served(RunningTraining(tmp_path))
     page = Viewer(browser, server.server.url)
     page.until("document.getElementById('live-phase').textContent.includes('No training')")
     server.close()
@@ -100,7 +100,7 @@ def test_it_says_when_its_server_is_gone(browser: Any, tmp_path: Path) -> None:
 
 def test_a_vanilla_training_shows_its_figures(browser: Any, tmp_path: Path) -> None:
     with RunningTraining(tmp_path, field="vanilla") as training:
-        server = Served(training.root)
+        server = Served(training)
         page = Viewer(browser, server.server.url)
         page.until("follower.cannot")
         assert "hash-grid" in page.run("document.getElementById('message').textContent")

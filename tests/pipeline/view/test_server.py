@@ -47,10 +47,10 @@ class Answer(NamedTuple):
 
 
 class Served:
-    """A server in a thread, which browsers and others ask."""
+    """A server of ``training``'s workspace in a thread, which browsers and others ask."""
 
-    def __init__(self, root: Path) -> None:
-        self.server = ViewServer(root)
+    def __init__(self, training: RunningTraining) -> None:
+        self.training, self.server = training, ViewServer(training.root)
         self.thread = threading.Thread(target=self.server.server.run, kwargs={"sockets": [self.server.listener]})
         self.thread.start()
 
@@ -71,7 +71,7 @@ class Served:
         """What the state says once it says ``so``."""
         ends = time.monotonic() + WAIT_SECONDS
         while not so(told := self.ask().told):
-            assert time.monotonic() < ends, told
+            assert self.training.error is None and time.monotonic() < ends, (self.training.error, told)
             time.sleep(0.1)
         return told
 
@@ -88,7 +88,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningTrainin
 
 @pytest.fixture
 def served(running: RunningTraining) -> Iterator[Served]:
-    server = Served(running.root)
+    server = Served(running)
     yield server
     server.close()
 
@@ -245,7 +245,7 @@ def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_two_servers_show_one_training_to_its_end(tmp_path: Path) -> None:
     with RunningTraining(tmp_path) as training:
-        one, two = Served(training.root), Served(training.root)
+        one, two = Served(training), Served(training)
         shown = []
         for server in (one, two):
             told = server.until(lambda told: told["field"] and len(told["curve"]) > 2)
@@ -268,7 +268,7 @@ def test_two_servers_show_one_training_to_its_end(tmp_path: Path) -> None:
 
 def test_without_a_training_it_says_so(tmp_path: Path) -> None:
     training = RunningTraining(tmp_path)
-    server = Served(training.root)
+    server = Served(training)
     assert server.ask().told == {"phase": "stopped", "key": KEYS["train"], "field": None}
     assert server.ask("scene").status == 204
     assert server.ask("finish", "POST", Origin=f"http://127.0.0.1:{server.server.port}").told == {"asked": False}
@@ -279,7 +279,7 @@ def test_without_a_training_it_says_so(tmp_path: Path) -> None:
 
 def test_a_finished_page_is_served_where_nothing_runs(tmp_path: Path) -> None:
     with RunningTraining(tmp_path, steps=60) as training:
-        server = Served(training.root)
+        server = Served(training)
         training.wait()
         training.make_page("all of it")
         assert server.ask().told["phase"] == "finished" and b"follow();" in server.ask("").body, "a run may train anew"
