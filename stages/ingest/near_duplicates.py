@@ -30,7 +30,7 @@ MIN_CORNERS, MAX_CORNERS = 30, 200
 CELLS = 16
 MIN_CORRELATION = 0.8
 MAX_CANDIDATES = 4
-MIN_BRACKET_EV = 0.5  # between the darkest and the lightest of one place: three exposures a third of a stop apart span two
+MIN_BRACKET_EV = 0.5  # between the darkest and the lightest of one place: three, a third of a stop apart, span more
 # Of 255. Of a pixel that is darker, rounding and noise leave ever less; nothing is left of a clipped one.
 DARK, CLIPPED = 48, 250
 GAMMA = 2.2  # about what takes sRGB to linear light

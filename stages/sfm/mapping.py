@@ -69,13 +69,14 @@ def run_mapping(
     state.begin("mapping", done=0)
     seed, camera_is_known = state.job.seed, state.job.camera_params is not None
     models, matches = Path(state.job.folder, "models"), database
-    beside = _start_global_mapping(strategy, database, state)
-    mapping, hold_focal = strategy.mapping or MappingOptions(), False
+    mapping = strategy.mapping or MappingOptions()
+    hold_focal = told_by_few = False
     if state.thinned:
         matches = state.sibling("thinned")
         hold_focal = thin_matches(database, matches, camera_is_known=camera_is_known) and mapping.hold_focal
         if hold_focal and strategy.mapping is not None:
-            calibrate_by_few(matches, mapping, state)
+            told_by_few = calibrate_by_few(matches, mapping, state)
+    beside = _start_global_mapping(strategy, matches, camera_is_known or told_by_few, state)
     options = incremental_options(seed, mapping, camera_is_known, state.thinned, hold_focal)
     trusted = consecutive_pairs(state) if strategy.matches == "consecutive" else set[tuple[int, int]]()
     if strategy.mapping is None:
@@ -105,8 +106,9 @@ def run_mapping(
     return found, checked, compared
 
 
-def calibrate_by_few(matches: Path, mapping: MappingOptions, state: JobState) -> None:
-    """Give the cameras that the best linked photos share the intrinsics of a model of these alone.
+def calibrate_by_few(matches: Path, mapping: MappingOptions, state: JobState) -> bool:
+    """Give the cameras that the best linked photos share the intrinsics of a model of these alone. Returns whether these
+    are the cameras of all photos.
 
     All pairs together know nothing of distortion. Where the camera looks across its path, photo by photo, mapping with
     a focal length that is a little off bends a straight path, in the end to a circle, and no adjustment of hundreds of
@@ -117,7 +119,7 @@ def calibrate_by_few(matches: Path, mapping: MappingOptions, state: JobState) ->
     options.image_names = few
     found = _map_incrementally(matches, options, state)
     if not found or 2 * found[0].num_reg_images() < len(few):
-        return
+        return False
     told = {camera.camera_id: camera.mean_focal_length() for camera in found[0].cameras.values()}
     release_focal_lengths(found[0])
     known = [
@@ -129,7 +131,8 @@ def calibrate_by_few(matches: Path, mapping: MappingOptions, state: JobState) ->
             MAX_EXIF_RATIO,
         )
     ]
-    adopt_cameras(matches, found[0], known)
+    adopted = adopt_cameras(matches, found[0], known)
+    return len(adopted) == len({photo.camera_group for photo in state.photos})
 
 
 def _map_incrementally(matches: Path, options: Any, state: JobState) -> list[Any]:
@@ -196,12 +199,15 @@ def _comparison(model: Any, other: Any, checks: Sequence[Candidate], database: P
     return compared
 
 
-def _start_global_mapping(strategy: Strategy, database: Path, state: JobState) -> "global_mapping.Started | None":
-    """Global mapping begun beside the first strategy; None where it would tell nothing."""
+def _start_global_mapping(
+    strategy: Strategy, matches: Path, cameras_are_known: bool, state: JobState
+) -> "global_mapping.Started | None":
+    """Global mapping begun beside the first strategy, of the same matches; None where it would tell nothing. It adjusts
+    cameras that are not known more freely than incremental mapping, and bends a straight path by it."""
     if strategy.name != STRATEGIES[0].name or len(state.photos) < global_mapping.MIN_PHOTOS:
         return None
-    known, folder = state.job.camera_params is not None, state.log.folder / "global"
-    return global_mapping.start(database, state.sibling("global"), state.images, folder, state.job.seed, known)
+    thinned, folder = state.sibling("global"), state.log.folder / "global"
+    return global_mapping.start(matches, thinned, state.images, folder, state.job.seed, cameras_are_known)
 
 
 def _checked(

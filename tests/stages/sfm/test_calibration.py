@@ -62,7 +62,8 @@ def test_the_best_linked_images_hang_together(strip: Path) -> None:
 def test_few_photos_tell_focal_length_and_distortion(strip: Path, tmp_path: Path) -> None:
     job: Any = SimpleNamespace(seed=0, folder=str(tmp_path))
     state = SimpleNamespace(job=job, images=tmp_path, thinned=True, send=lambda **_: None)
-    calibrate_by_few(strip, MappingOptions(), cast(Any, state))
+    state.photos = [SimpleNamespace(camera_group=0)] * PHOTOS
+    assert calibrate_by_few(strip, MappingOptions(), cast(Any, state))
     with pycolmap.Database.open(strip) as db:
         camera = db.read_camera(1)
     assert camera.has_prior_focal_length
