@@ -107,8 +107,8 @@ def run_mapping(
 
 
 def calibrate_by_few(matches: Path, mapping: MappingOptions, state: JobState) -> bool:
-    """Give the cameras that the best linked photos share the intrinsics of a model of these alone. Returns whether these
-    are the cameras of all photos.
+    """Give the cameras that the best linked photos share the intrinsics of a model of these alone. Returns whether
+    these are the cameras of all photos.
 
     All pairs together know nothing of distortion. Where the camera looks across its path, photo by photo, mapping with
     a focal length that is a little off bends a straight path, in the end to a circle, and no adjustment of hundreds of

@@ -192,7 +192,7 @@ def test_of_brackets_the_best_exposed_is_kept_the_same_everywhere() -> None:
     ],
 )
 def test_pictures_of_brackets_keep_the_well_exposed(stops: tuple[float, ...], best: float, by_exposure: bool) -> None:
-    """Pairs, five exposures and thirds of a stop (these places are dark), and exposures that are folders of their own."""
+    """Pairs, five exposures and thirds of a stop (the places are dark), and exposures in folders of their own."""
     places = [np.clip(0.4 * seen(60 * place - 40) + 40, 0, 255).astype(np.uint8) for place in range(2)]
     order = [(place, ev) for ev in stops for place in range(2)] if by_exposure else list(product(range(2), stops))
     pictures = [exposed(places[place], ev) for place, ev in order]
