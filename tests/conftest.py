@@ -4,17 +4,19 @@ import functools
 import pkgutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from hypothesis import settings
-from jaxtyping import install_import_hook
+from jaxtyping import config, install_import_hook
 
 # Every module by its name, and so none of nerf.kernels.warp: kernels are compiled from their source, undecorated.
 NERF = Path(__file__).parents[1] / "nerf"
 MODULES = [".".join(file.relative_to(NERF.parent).with_suffix("").parts) for file in NERF.glob("**/*.py")]
 CHECKED = [name for name in MODULES if not name.startswith("nerf.kernels.warp") and not name.endswith("__init__")]
 install_import_hook(CHECKED, "beartype.beartype")
+CHECKED_STEPS = 20
 
 # Tensors of tests are tiny: torch's threads would only wait for each other, most of all on a busy machine.
 torch.set_num_threads(1)
@@ -73,6 +75,29 @@ def rates_are_measured_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("stages.train.profile.measure_rates", lambda device, *_: once(device))
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shapes_of_some_steps_are_checked() -> Iterator[None]:
+    """Of a training the first steps and every twentieth after them: the others have the same shapes, and checking these
+    takes a third of a tiny step."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("nerf.training.hash_grid_trainer:HashGridTrainer", "nerf.training.vanilla_trainer:VanillaTrainer"):
+            trainer = pkgutil.resolve_name(name)
+            patch.setattr(trainer, "step", _checked_at_times(trainer.step))
+        yield
+
+
+def _checked_at_times(step: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(step)
+    def at_times(trainer: object, number: int, *rest: Any) -> Any:
+        config.jaxtyping_disable = number >= CHECKED_STEPS and number % CHECKED_STEPS > 0
+        try:
+            return step(trainer, number, *rest)
+        finally:
+            config.jaxtyping_disable = False
+
+    return at_times
 
 
 @pytest.fixture(autouse=True)
