@@ -100,6 +100,14 @@ def _checked_at_times(step: Callable[..., Any]) -> Callable[..., Any]:
     return at_times
 
 
+@pytest.fixture(scope="session", autouse=True)
+def nothing_waits_for_the_disk() -> Iterator[None]:
+    """No test cuts the power, and of a thousand files each would wait for milliseconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.fsync", lambda descriptor: None)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def cores_are_free(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever took over the cores in another test (nerf/runtime/parallel.py)."""
