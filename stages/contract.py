@@ -17,6 +17,8 @@ and may have (:data:`DEFAULTS` hold otherwise)
   its key and are not brought up to date for it, nor given to it where damaged, so no output may depend on them;
 * ``more_inputs(config) -> tuple[str, ...]``: the stages that it reads beside its ``INPUTS`` because its options ask for
   it (:func:`inputs_of`);
+* ``DISPENSABLE: tuple[str, ...]``: those of its inputs without which it works as well: where one of these has no result
+  the stage goes without, under another key. A run goes on when a stage fails that all later ones can go without;
 * ``NOT_HASHED: tuple[str, ...]``: options that cannot change the result and so do not enter the key;
 * ``plan(config, inputs, progress) -> Config``: replaces every ``None`` ("choose for me") by a value, where it must by
   timing a piece of the work. :func:`plan_stage` calls it, once, before the stage's first run; the answer is kept in
@@ -264,6 +266,7 @@ def _unlimited(options: Mapping[str, Any]) -> float | None:
 DEFAULTS: dict[str, Any] = {
     "OPTIONAL_INPUTS": (),
     "more_inputs": _nothing_more,
+    "DISPENSABLE": (),
     "NOT_HASHED": (),
     "plan": None,
     "ON_REQUEST": False,

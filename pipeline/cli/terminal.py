@@ -170,6 +170,7 @@ class RichDisplay:
         self._console.print(text, style=style, markup=False, soft_wrap=True)
 
     def begin(self, stage: str) -> None:
+        self._clear()  # the line of a stage that failed
         self._stage = stage
         self._task = self.progress.add_task("starting", total=None, stage=stage)
 

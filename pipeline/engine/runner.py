@@ -143,7 +143,8 @@ class Runner:
         ``force`` names stages that run again even where a finished result exists; ``replan`` those of which is
         forgotten what was chosen for the user before; ``remember`` makes ``stages`` what `pipeline resume` repeats;
         ``times`` are the seconds that stages are expected to take (:meth:`forecast`), for a budget and the
-        report; ``verify`` reads every file of a finished result before it counts as finished.
+        report; ``verify`` reads every file of a finished result before it counts as finished. A stage that fails ends
+        the run, unless all later ones can go without it: then it is raised when these are done.
         """
         self.verify, self.force, self.stages, self.times = verify, force, list(stages), times or {}
         if self.budget:
@@ -155,8 +156,9 @@ class Runner:
         if remember:
             self.run_file.stages = list(stages)
         self.workspace.write_run(self.run_file)
+        failures: list[StageFailed] = []
         try:
-            ran = [self._bring_up_to_date(stage) for stage in stages]
+            ran = [self._attempted(stage, failures) for stage in stages]
         except Exception as problem:
             self._unlink_outdated()
             if isinstance(problem, StageFailed):
@@ -167,7 +169,31 @@ class Runner:
             raise
         self._unlink_outdated()
         self._close_account(remember)
+        if failures:
+            raise failures[0]
         return any(ran)
+
+    def _attempted(self, stage: str, failures: list[StageFailed]) -> bool:
+        """Bring ``stage`` up to date; True if anything ran. Its failure joins ``failures`` where the run goes on."""
+        try:
+            return self._bring_up_to_date(stage)
+        except StageFailed as failure:
+            error = failure.error
+            if failures:  # the first decides how the run ends
+                self.display.note("pipeline.failed-too", f"failed, too: {error.what}: {error.why}")
+                raise failures[0] from failure
+            if failure.stage != stage or not self._can_go_without(stage):
+                raise
+            failures.append(failure)
+            self.running = ""
+            self.display.note("pipeline.goes-on", f"failed: {error.what}; the run continues without it")
+            return True
+
+    def _can_go_without(self, stage: str) -> bool:
+        """Whether later stages of this run read the result of ``stage``, and none of them needs it."""
+        later = self.stages[self.stages.index(stage) + 1 :]
+        readers = [name for name in later if stage in self._inputs(name) and not is_summary(name, STAGES)]
+        return bool(readers) and all(stage in declared(STAGES[name], "DISPENSABLE") for name in readers)
 
     def _close_account(self, whole_run: bool) -> None:
         """A run that ended by itself, well or not, is over; one stage of an interrupted run does not end it."""
@@ -269,7 +295,8 @@ class Runner:
         """
         module, summary = STAGES[stage], is_summary(stage, STAGES)
         read = self._inputs(stage)
-        upstream = {name: m for name in read if (m := self._upstream(name, needed=not summary)) is not None}
+        needed = () if summary else {*read} - {*declared(module, "DISPENSABLE")}
+        upstream = {name: m for name in read if (m := self._upstream(name, name in needed)) is not None}
         names = declared(module, "OPTIONAL_INPUTS")
         optional = {name: m for name in names if (m := self._upstream(name, needed=False)) is not None}
         folders = {name: self.workspace.folder(name, m.key) for name, m in (upstream | optional).items()}

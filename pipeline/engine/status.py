@@ -73,7 +73,8 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
 
 def _why_unplanned(runner: Runner, stage: str, last: Manifest) -> str:
     """Why a stage whose inputs are there has not the result it needs, while its open options are not chosen yet."""
-    inputs = {name: runner.done[name].outputs_digest for name in inputs_of(STAGES[stage], runner.options[stage])}
+    read = inputs_of(STAGES[stage], runner.options[stage])
+    inputs = {name: runner.done[name].outputs_digest for name in read if name in runner.done}
     return "; ".join(_other_inputs(inputs, last)) or "its automatic options are chosen again"
 
 

@@ -15,6 +15,7 @@ INPUTS = ("ingest", "normalise", "scale", "train")
 VERSION = 4
 EXIT_CODE = 21
 RESUMES = False
+DISPENSABLE = ("mesh",)
 PUBLISHED = ("viewer.html",)
 
 
@@ -34,7 +35,7 @@ class Config(StageConfig):
 
 
 def more_inputs(config: Config) -> tuple[str, ...]:
-    """The mesh, where the page is to have it."""
+    """The mesh, where the page is to have it. A mesh that fails leaves a page without one."""
     return ("mesh",) if config.mesh == "on" else ()
 
 

@@ -5,7 +5,7 @@ const BACKGROUNDS = { white: [1, 1, 1], black: [0, 0, 0] };
 
 class Viewer {
   constructor(canvas, contents) {
-    Object.assign(this, { canvas, contents, view: "colour", background: "trained", stops: 0, photo: null, crop: null });
+    Object.assign(this, { canvas, contents, view: "colour", background: "trained", stops: 0, photo: null, nextPhoto: null, crop: null });
     Object.assign(this, { measured: [], isMeasuring: false, path: new CameraPath(), lens: lensOf(contents.scene.lens) });
     this.training = contents.views.filter((view) => view.split === "train");
     this.navigation = new Navigation(canvas, contents.scene.up, (kind) => this.moved(kind), (x, y) => this.clicked(x, y));
@@ -83,8 +83,7 @@ class Viewer {
   }
 
   moved(kind) {
-    if (!kind && this.photo !== null) this.photo = null;
-    if (!kind) this.playing = false;
+    if (!kind) Object.assign(this, { photo: null, nextPhoto: null, playing: false });
     this.moveTime = now();
     this.renderer?.touch();
     this.panels?.update();
@@ -104,21 +103,21 @@ class Viewer {
   async showPhoto(index) {
     const view = this.contents.views[index];
     this.lens = view.lens;
-    this.photo = null;
-    const distance = this.navigation.distance;
-    await this.navigation.flyTo(view.pose, distance);
-    this.photo = index;
+    [this.photo, this.nextPhoto] = [null, index];
+    await this.navigation.flyTo(view.pose);
+    if (this.nextPhoto !== index) return; // it was left on the way
+    [this.photo, this.nextPhoto] = [index, null];
     this.changed();
   }
 
   leavePhoto() {
-    this.photo = null;
+    this.photo = this.nextPhoto = null;
     this.changed();
   }
 
   reset() {
     this.lens = lensOf(this.contents.scene.lens);
-    this.photo = null;
+    this.photo = this.nextPhoto = null;
     return this.navigation.flyTo(this.home(), this.homeDistance);
   }
 
@@ -171,7 +170,7 @@ class Viewer {
     const point = this.pointAt((event.clientX - box.left) * ratio, (event.clientY - box.top) * ratio);
     if (!point || this.isMeasuring) return;
     const { pose } = this.navigation, depth = dot(subtract(point, pose.centre), forward(pose));
-    this.photo = null;
+    this.photo = this.nextPhoto = null;
     const aside = subtract(subtract(point, pose.centre), scaled(forward(pose), depth));
     this.navigation.flyTo({ ...pose, centre: add(pose.centre, aside) }, depth);
   }
@@ -212,7 +211,6 @@ class Viewer {
     const isWhole = centre.length === 3 && turn.length === 4 && [...centre, ...turn, distance].every(Number.isFinite);
     if (!isWhole || !(norm(turn) > 0) || !(distance > 0)) return;
     this.linked = true;
-    this.photo = null;
     this.navigation.distance = distance;
     if (values.get("v") in VIEWS) this.view = values.get("v");
     this.navigation.moveTo({ centre, rotation: rotationOf(unit(turn)) });

@@ -3,7 +3,7 @@
 const TURN_PER_WIDTH = Math.PI; // radians of a drag across the whole view
 const KEY_TURN = 1.2, KEY_FLY = 0.8; // radians and orbit distances a second
 const WHEEL_ZOOM = 0.0012; // of the logarithm of the distance, a pixel of the wheel
-const CLICK_PX = 5; // that a click may move
+const CLICK_PX = { mouse: 5, pen: 8, touch: 12 }; // that a click may move
 const FLIGHT_MS = 700;
 const MIN_DISTANCE = 1e-3;
 const STEEPEST = 0.995; // cosine between view and up: an orbit ends before it tips over
@@ -106,7 +106,7 @@ class Navigation {
     if (!last || !this.pressedAt) return;
     const dx = event.clientX - last.x, dy = event.clientY - last.y;
     const away = Math.hypot(event.clientX - this.pressedAt.x, event.clientY - this.pressedAt.y);
-    if (away > CLICK_PX) this.pressedAt.moved = true;
+    if (away > (CLICK_PX[event.pointerType] ?? CLICK_PX.mouse)) this.pressedAt.moved = true;
     if (!this.pressedAt.moved) return;
     if (this.pointers.size > 1) return this.pinched(event);
     this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });

@@ -2,6 +2,7 @@
 
 const byId = (id) => document.getElementById(id);
 const SAID_MS = 2500;
+const ROOMY_PX = 900; // on a narrower screen the menu would hide the scene
 
 class Panels {
   constructor(viewer) {
@@ -28,10 +29,13 @@ class Panels {
   menu() {
     const panel = byId("panel"), toggle = (open) => {
       panel.hidden = !open;
+      document.body.classList.toggle("with-panel", open);
       byId("menu").setAttribute("aria-expanded", String(open));
     };
     this.on("menu", "click", () => toggle(panel.hidden));
-    toggle(window.innerWidth > 900); // on a smaller one it would hide the scene
+    this.isRoomy = () => window.innerWidth > ROOMY_PX;
+    toggle(this.isRoomy());
+    this.on("views", "change", () => this.isRoomy() || toggle(false));
   }
 
   shown() {
@@ -91,7 +95,7 @@ class Panels {
     }
     list.addEventListener("change", () => list.value !== "" && viewer.showPhoto(Number(list.value)));
     byId("photos-note").textContent = section("photo0") ? "" : byId("payload") ? "This file contains no photos." : "Photos are in the page of the finished run.";
-    const step = (by) => viewer.showPhoto((viewer.photo + by + views.length) % views.length);
+    const step = (by) => viewer.showPhoto(((viewer.photo ?? viewer.nextPhoto) + by + views.length) % views.length);
     this.on("photo-before", "click", () => step(-1));
     this.on("photo-after", "click", () => step(1));
     this.on("photo-close", "click", () => viewer.leavePhoto());
@@ -196,20 +200,20 @@ class Panels {
 
   /** Brings everything in line with the viewer. */
   update() {
-    const { viewer } = this, { photo } = viewer, distance = viewer.distance();
+    const { viewer } = this, { photo } = viewer, chosen = photo ?? viewer.nextPhoto, distance = viewer.distance();
     document.querySelector(`input[name="view"][value="${viewer.view}"]`).checked = true;
     byId("distance").textContent = distance ? `${distance.value.toPrecision(4)} ${distance.unit}` : viewer.measured.length ? "one point" : "–";
     const count = viewer.path.keys.length;
     byId("path-count").textContent = count ? `${count} key-frame${count > 1 ? "s" : ""}` : "No key-frames";
     byId("path-save").disabled = byId("path-play").disabled = count < 2;
     byId("path-remove").disabled = count < 1;
-    byId("compare").hidden = photo === null;
-    byId("views").value = photo ?? "";
+    byId("compare").hidden = chosen === null; // on the way there it stays, with the focus that it may have
+    byId("views").value = chosen ?? "";
     const picture = photo === null ? null : viewer.contents.section(`photo${photo}`);
     byId("photo").hidden = !picture;
-    if (photo === null) return;
-    byId("photo-name").textContent = viewer.contents.views[photo].name;
-    byId("photo-share").disabled = !picture;
+    if (chosen === null) return;
+    byId("photo-name").textContent = viewer.contents.views[chosen].name;
+    byId("photo-share").disabled = !viewer.contents.section(`photo${chosen}`);
     if (picture) this.showPicture(photo, picture);
   }
 

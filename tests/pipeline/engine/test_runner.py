@@ -14,6 +14,7 @@ from pipeline.engine.failures import StageFailed
 from pipeline.engine.job import NotReady
 from pipeline.engine.runner import Runner
 from pipeline.engine.workspace import Workspace
+from stages.contract import StageError
 from stages.ingest.sources import find_source
 from tests.pipeline.engine import fake_stages
 from tests.pipeline.engine.fake_stages import FakeSettings, calls
@@ -394,3 +395,60 @@ def test_clean_keeps_what_is_used(bring: Bring, tmp_path: Path):
     stale = workspace.stale_folders(workspace.read_run().keys, list(ALL))
     assert [p.parent.name for p in stale] == ["train"]
     assert bring(train={"steps": 5}) is False
+
+
+@pytest.fixture
+def dispensable_sfm(monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
+    """Train reads ingest, and sfm where it has a result; returns what each run of it was given."""
+    train, given = fake_stages.STAGES["train"], list[set[str]]()
+    run = train.run
+    monkeypatch.setattr(train, "INPUTS", ("ingest", "sfm"))
+    monkeypatch.setattr(train, "DISPENSABLE", ("sfm",), raising=False)
+    monkeypatch.setattr(
+        train, "run", lambda config, inputs, *rest: given.append({*inputs}) or run(config, inputs, *rest)
+    )
+    return given
+
+
+def test_a_run_goes_on_without_what_later_stages_can_spare(
+    bring: Bring, tmp_path: Path, dispensable_sfm: list[set[str]], monkeypatch: pytest.MonkeyPatch
+):
+    codes: list[str] = []
+    monkeypatch.setattr(SilentDisplay, "note", lambda _, code, message: codes.append(code))
+    with pytest.raises(StageFailed) as caught:
+        bring(sfm={"fail": True})
+    assert caught.value.stage == "sfm" and dispensable_sfm == [{"ingest"}] and codes == ["pipeline.goes-on"]
+    assert (tmp_path / "w.nerf/output/result.json").is_file() and not (tmp_path / "w.nerf/output/deep").exists()
+    states = [s.state for s in status.all_statuses(*reader(tmp_path / "w.nerf"), deep=False)]
+    assert states == ["cached", "failed", "cached"]
+    with pytest.raises(StageFailed):
+        bring(sfm={"fail": True})
+    assert calls == ["sfm"], "what was made without it stays"
+    bring()
+    assert dispensable_sfm == [{"ingest"}, {"ingest", "sfm"}], "what has it now is made anew"
+
+
+def test_the_first_failure_decides_the_end(
+    bring: Bring, dispensable_sfm: list[set[str]], monkeypatch: pytest.MonkeyPatch
+):
+    def fail(*_: object) -> None:
+        raise StageError("train.fake", "it failed", "as well", "Nothing.")
+
+    codes: list[str] = []
+    monkeypatch.setattr(SilentDisplay, "note", lambda _, code, message: codes.append(code))
+    monkeypatch.setattr(fake_stages.STAGES["train"], "run", fail)
+    with pytest.raises(StageFailed) as caught:
+        bring(sfm={"fail": True})
+    assert caught.value.stage == "sfm" and codes == ["pipeline.goes-on", "pipeline.failed-too"]
+    with pytest.raises(StageFailed) as caught:
+        bring()
+    assert caught.value.stage == "train"
+
+
+def test_a_failure_ends_the_run_of_what_needs_it(bring: Bring, dispensable_sfm: list[set[str]]):
+    with pytest.raises(StageFailed):
+        bring(sfm={"fail": True}, stages=("ingest", "sfm"))
+    fake_stages.STAGES["train"].DISPENSABLE = ()
+    with pytest.raises(StageFailed):
+        bring(sfm={"fail": True})
+    assert dispensable_sfm == []

@@ -21,7 +21,7 @@ from stages.viewer.tables import quantised, with_table
 from tests.conftest import SilentProgress
 from tests.stages.photo_scene import FOCAL, HEIGHT, WIDTH, ball_photo, photographed
 from tests.stages.viewer.browser import Viewer, chromium, pinhole_rays, psnr, rendered, request_of
-from tests.stages.viewer.made_fields import Made, gains, inside_pose, made, renamed
+from tests.stages.viewer.made_fields import NAMES, Made, gains, inside_pose, made, renamed
 
 MIN_AGREEMENT = 45.0  # dB; 8 bits of a picture alone leave 59
 LENS = [48, 36, 40.0, 41.0, 22.0, 19.0]
@@ -187,6 +187,58 @@ def test_two_fingers_zoom(ball: Viewer):
     ball.until("!viewer.navigation.flight")
 
 
+def test_a_finger_may_tremble_as_it_taps(ball: Viewer):
+    tap = """([type, by]) => {
+      const touch = (name, x) => viewer.canvas.dispatchEvent(new PointerEvent(name, {
+        pointerId: 13, pointerType: type, clientX: x, clientY: 30, bubbles: true, buttons: 1 }));
+      const [before, clicks] = [viewer.navigation.pose, []];
+      viewer.clicked = (x) => clicks.push(x);
+      touch("pointerdown", 30); touch("pointermove", 30 + by); touch("pointerup", 30 + by);
+      delete viewer.clicked;
+      return [clicks.length, before === viewer.navigation.pose]; }"""
+    assert ball.run(tap, ["touch", 9]) == [1, True] and ball.run(tap, ["mouse", 9]) == [0, False]
+    assert ball.run(tap, ["touch", 15]) == [0, False]
+    ball.run("viewer.reset()")
+    ball.until("!viewer.navigation.flight")
+
+
+LAYOUT = """() => {
+  const seen = [...document.querySelectorAll("button, input, select, summary, output, code")]
+    .filter((e) => e.offsetParent !== null && e.textContent + e.id), box = (id) => byId(id).getBoundingClientRect();
+  const meet = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
+  const pairs = [["panel", "menu"], ["panel", "compare"], ["compare", "menu"]];
+  return {
+    outside: seen.map((e) => [e.id || e.textContent, e.getBoundingClientRect()])
+      .filter(([, { left, right }]) => left < 0 || right > innerWidth),
+    overlap: pairs.filter(([a, b]) => meet(box(a), box(b))),
+    scrolls: document.documentElement.scrollWidth > innerWidth || byId("panel").scrollWidth > byId("panel").clientWidth,
+    scene: box("canvas").width * box("canvas").height / (innerWidth * innerHeight),
+  };
+}"""
+
+
+@pytest.mark.parametrize("size", [(320, 568), (568, 320), (768, 1024), (1280, 800), (2560, 1440)])
+def test_controls_fit_screens_of_any_size(ball: Viewer, size: tuple[int, int]):
+    """Menu open with all its parts, a photo compared: nothing is cut off or lies over another."""
+    ball.page.set_viewport_size({"width": size[0], "height": size[1]})
+    ball.run("() => { if (byId('panel').hidden) byId('menu').click(); }")
+    ball.run("document.querySelectorAll('details').forEach((each) => (each.open = true))")
+    ball.run("viewer.photo = 0; viewer.changed()")
+    assert ball.run(LAYOUT) == {"outside": [], "overlap": [], "scrolls": False, "scene": 1}
+    ball.run("document.querySelectorAll('details').forEach((each) => (each.open = false))")
+    ball.run("viewer.leavePhoto(); byId('menu').click()")
+    ball.page.set_viewport_size({"width": 120, "height": 90})
+
+
+def test_on_a_phone_a_chosen_photo_closes_the_menu(ball: Viewer):
+    ball.run("() => { if (byId('panel').hidden) byId('menu').click(); }")
+    ball.page.locator("#views").select_option("1")
+    assert ball.run("byId('panel').hidden && byId('menu').getAttribute('aria-expanded') === 'false'")
+    ball.until("viewer.photo === 1")
+    ball.run("viewer.reset()")
+    ball.until("!viewer.navigation.flight")
+
+
 def test_views_differ_and_all_pixels_fill_in(ball: Viewer):
     pictures = {}
     for number, view in enumerate(("colour", "depth", "normals", "opacity"), 1):
@@ -212,8 +264,20 @@ def test_a_click_on_a_camera_shows_its_photo(ball: Viewer):
     assert ball.run("document.getElementById('photo-name').textContent") == ball.run(
         f"viewer.contents.views[{index}].name"
     )
-    assert ball.run("document.querySelectorAll('b').length") == 0, "a name is text and no HTML"
+    for other, name in enumerate(NAMES):
+        ball.run(f"viewer.photo = {other}; viewer.changed()")
+        assert ball.run("document.getElementById('photo-name').textContent") == name
+    assert ball.run("document.querySelectorAll('b, label img').length") == 0, "a name is text and no HTML"
+    ball.run(f"viewer.photo = {index}; viewer.changed()")
     ball.run("document.getElementById('layer-cameras').click()")
+    ball.page.locator("#photo-after").press("Enter")
+    bar = "[byId('compare').hidden, document.activeElement.id, Number(byId('views').value)]"
+    after = (index + 1) % ball.run("viewer.contents.views.length")
+    assert ball.run(bar) == [False, "photo-after", after], "the focus stays while the camera flies"
+    ball.until(f"viewer.photo === {after}")
+    ball.run("viewer.showPhoto(0); viewer.leavePhoto()")
+    ball.until("!viewer.navigation.flight")
+    assert ball.run("viewer.photo") is None and ball.run("byId('compare').hidden"), "it was left on the way"
     ball.run("viewer.reset()")
     ball.until("!viewer.navigation.flight")
     assert ball.run("document.getElementById('photo').hidden")
