@@ -5,12 +5,13 @@ there is no time for all of it, in tiles. PSNR is taken from the float image in 
 photos are means of the photos' own.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
 
-from stages.contract import Auto, Flexible, Inputs, Progress, StageConfig, StageResult, Workload
+from stages.contract import Auto, Flexible, Inputs, Progress, SilentProgress, StageConfig, StageResult, Workload
 from stages.evaluate.seconds import SHARE, other_seconds
 from stages.train import trained_seconds
 
@@ -77,5 +78,5 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     from stages.evaluate.scoring import load, save, score
 
     scorer = load(config, inputs, progress)
-    images = score(scorer, folder, progress)
+    images = score(scorer, folder, progress, partial(load, config, dict(inputs), SilentProgress()))
     return save(scorer, images, folder)

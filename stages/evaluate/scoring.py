@@ -1,8 +1,9 @@
 """From a trained field to figures: test photos are rendered, whole or in tiles, and compared with the photos."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,6 +22,7 @@ from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
 from stages.evaluate.image_metrics import error_map, ssim
 from stages.evaluate.summary import FIGURES, line_of, overall, photos_in_words, verdict
 from stages.evaluate.tiles import PREVIEW_SHARE, Tiles, tiles_of
+from stages.hardware.cluster import fan_out
 from stages.io.files import read_json, read_scene, write_json, write_png
 from stages.render.renderer import Renderer, load_renderer
 from stages.train.config import BLACK, WHITE
@@ -75,8 +77,9 @@ def fits_poses(config: "Config", field: dict[str, Any]) -> bool:
 # --- compute
 
 
-def score(scorer: "Scorer", folder: Path, progress: Progress) -> Scores:
-    """Score every test photo of which masks leave something, and write its picture and error map into ``folder``."""
+def score(scorer: "Scorer", folder: Path, progress: Progress, reload: Callable[[], "Scorer"]) -> Scores:
+    """Score every test photo of which masks leave something, and write its picture and error map into ``folder``. On a
+    cluster each process makes the scorer for itself by ``reload``."""
     for name in ("renders", "errors"):
         (folder / name).mkdir()
     test = scorer.scene.of_split("test")
@@ -89,14 +92,38 @@ def score(scorer: "Scorer", folder: Path, progress: Progress) -> Scores:
     if not views:
         return Scores([], notes)
     progress.update("averaging the training photos")
-    mean, images = scorer.mean_photo(), []
-    for number, view in enumerate(views):
+    mean = scorer.mean_photo()
 
-        def on_chunk(share: float, number: int = number) -> None:
-            progress.update(f"test photo {number + 1} of {len(views)}", (number + share) / len(views))
+    def here(work: object, photos: Iterable[tuple[int, View]]) -> Iterator[dict[str, Any]]:
+        for number, view in photos:
 
-        images.append(scorer.score(view, number, mean, folder, on_chunk))
+            def on_chunk(share: float, number: int = number) -> None:
+                progress.update(f"test photo {number + 1} of {len(views)}", (number + share) / len(views))
+
+            yield scorer.score(view, number, mean, folder, on_chunk)
+
+    images = list[dict[str, Any]]()
+    for figures in fan_out(_ScoreApart(reload, mean, folder), enumerate(views), here, "machine"):
+        images.append(figures)
+        progress.update(f"test photo {len(images)} of {len(views)}", len(images) / len(views))
     return Scores(images, notes)
+
+
+@dataclass(frozen=True)
+class _ScoreApart:
+    """Scores numbered photos on a machine of a cluster."""
+
+    load: Callable[[], "Scorer"]
+    mean: MeanPhoto
+    folder: Path
+
+    @cached_property
+    def scorer(self) -> "Scorer":
+        return self.load()
+
+    def __call__(self, photo: tuple[int, View]) -> dict[str, Any]:
+        number, view = photo
+        return self.scorer.score(view, number, self.mean, self.folder, lambda share: None)
 
 
 @dataclass(frozen=True)

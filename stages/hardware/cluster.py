@@ -2,14 +2,14 @@
 
 A stage gives :func:`fan_out` a function and the items to call it with. Both must pickle: a function of a module, or a
 partial of one. What the function is bound to travels once to each process, an item with every call, results back: so
-photos and large results stay in files, in folders that all machines see. A result may depend on nothing but function
-and item, so that a piece may be done again where its process dies, and by any machine.
+photos and large results stay in files, in folders that all machines see, and what many items need goes through
+:func:`share`. A result may depend on nothing but function and item, so that a piece may be done again where its process
+dies, and by any machine.
 
 Only this module knows Ray, and loads it only where a cluster was asked for. One remote function runs every work; few
 pieces are under way at a time.
 """
 
-import functools
 import importlib.metadata
 import itertools
 import logging
@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -77,6 +78,11 @@ class Cluster:
 
 
 _joined: Cluster | None = None
+
+
+def address() -> str | None:
+    """Of the cluster that this process belongs to; None without one."""
+    return _joined and _joined.address
 
 
 def at_once(place: Place) -> int:
@@ -138,6 +144,12 @@ def fan_out(
             due += 1
 
 
+def share(value: Result) -> Callable[[], Result]:
+    """What gives a value that many items need, here and in work. Each machine fetches it once; its processes have the
+    arrays in it, read-only, in common."""
+    return (lambda: value) if _joined is None else partial(_fetch, _joined.ray.put(value))
+
+
 def _numbered(
     cluster: Cluster, work: Callable[[Item], Result], items: Iterable[Item], place: Place
 ) -> Iterator[tuple[int, Result]]:
@@ -183,6 +195,8 @@ def _result(cluster: Cluster, reference: Any) -> Any:
     try:
         return cluster.ray.get(reference)
     except errors.RayTaskError as error:
+        if isinstance(error.cause, errors.RayError):  # what it needs has gone with a machine
+            raise _lost(cluster) from error
         raise error.cause from None  # as it would have been raised here
     except (errors.WorkerCrashedError, errors.OutOfMemoryError) as error:
         what = "a piece of work ended its process on the cluster again and again"
@@ -204,16 +218,20 @@ _work: tuple[str, Any] | None = None  # the latest, with what it has cached
 
 def _do(shared: list[Any], item: Any) -> Any:
     """A piece of work; its function is fetched by each process once."""
-    import ray  # pyright: ignore[reportMissingImports]
-
     global _work
     reference = shared[0]
     if _work is None or _work[0] != reference.hex():
-        _work = reference.hex(), ray.get(reference)
+        _work = reference.hex(), _fetch(reference)
     return _work[1](item)
 
 
-@functools.lru_cache(maxsize=4)
+def _fetch(reference: Any) -> Any:
+    import ray  # pyright: ignore[reportMissingImports]
+
+    return ray.get(reference)
+
+
+@lru_cache(maxsize=4)
 def _task(cluster: Cluster, place: Place) -> Any:
     share = {"num_cpus": 1} if place == "core" else cluster.machine_share
     threads = str(share["num_cpus"])

@@ -33,6 +33,7 @@ class Job:
     """What the parent asks for; ``photos`` are Photos as dicts in order of ``file``. ``folder`` gets ``sparse/``.
 
     ``camera_model`` None: SIMPLE_RADIAL for mapping, and in the end the one chosen by held-out observations.
+    ``cluster``: the address of the one that extracts and matches features; None: this machine.
     """
 
     folder: str
@@ -49,6 +50,7 @@ class Job:
     max_strategies: int
     seconds: float | None
     max_seconds: float
+    cluster: str | None = None
 
 
 class JobState:

@@ -13,7 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from stages.contract import Note
+from stages.contract import Note, StageError
+from stages.hardware import cluster
 from stages.io.amounts import rough_duration
 from stages.io.files import make_durable
 from stages.sfm.colmap.diagnosis import find_conflict, links, supports
@@ -47,7 +48,10 @@ def main() -> None:
         channel.write(json.dumps(message) + "\n")
 
     try:
-        send(result=reconstruct(job, send))
+        with cluster.joined(job.cluster):
+            send(result=reconstruct(job, send))
+    except StageError as error:
+        send(error=[error.code, error.what, error.why, error.hint])
     except Exception as fault:  # the log, where Python will write it, may lie on the disk that is full
         send(fault=f"{type(fault).__name__}: {fault}".splitlines()[0])
         raise

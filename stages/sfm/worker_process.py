@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from stages.contract import Progress, StageError
+from stages.hardware import cluster
 from stages.hardware.child_process import child_environment
 from stages.io.photos import Photo
 from stages.io.stopwatch import live_line
@@ -41,6 +42,7 @@ def run_worker(
         "images": str(images.absolute()),
         "database": str(database.absolute()),
         "photos": [asdict(photo) for photo in photos],
+        "cluster": cluster.address(),
         **config.model_dump(exclude={"cameras", "camera_axes", "pose_direction"}),  # of imported poses, read before
     }
     latest: dict[str, Any] = {"phase": "features", "database": job["database"], "done": 0, "pairs": 0}
@@ -67,6 +69,8 @@ def run_worker(
             overtime.cancel()
             child.kill()
             child.wait()
+    if error := latest.get("error"):
+        raise StageError(*error)
     if "result" not in latest:
         limit = config.max_seconds if late else None
         last = latest.get("fault") or _last_line(log)

@@ -1,4 +1,4 @@
-"""The score of a field is one figure, whichever stage computes it."""
+"""The score of a field is one figure, whichever stage computes it, and wherever."""
 
 from pathlib import Path
 from typing import Any
@@ -8,6 +8,7 @@ import pytest
 from stages import evaluate, train
 from stages.contract import run_stage
 from stages.evaluate import tiles
+from stages.hardware import cluster
 from stages.io.files import read_scene
 from stages.tradeoff import benchmark
 from stages.train.fields.hash_grid_options import HashGridOptions
@@ -27,3 +28,21 @@ def test_a_study_scores_as_evaluate_does(tmp_path: Path, progress: Any, monkeypa
     made = benchmark.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), None, 1000, 2.0)
     figures = benchmark.score(own, made, progress)
     assert figures["psnr"] == pytest.approx(facts["psnr"], abs=0.001)
+
+
+def test_a_cluster_scores_the_same(tmp_path: Path, progress: Any, ray_cluster: str) -> None:
+    photos, _ = photographed(tmp_path / "photos", channels=4)
+    own = tmp_path / "train"
+    own.mkdir()
+    run_stage(train, train.Config(steps=5, downscale=1.0, grid=GRID), photos, own, progress)
+
+    def scored(name: str) -> dict[str, bytes]:
+        folder = tmp_path / name
+        folder.mkdir()
+        run_stage(evaluate, evaluate.Config(fraction=1), photos | {"train": own}, folder, progress)
+        return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*.*")}
+
+    here = scored("here")
+    with cluster.joined(ray_cluster, [tmp_path]):
+        assert scored("there") == here
+    assert progress.updates[-1] == ("test photo 2 of 2", 1.0) and len(here) == 1 + 2 * 2

@@ -4,11 +4,11 @@ import math
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Container, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
-from itertools import combinations, product
+from itertools import chain, combinations, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool
 
+from stages.hardware import cluster
 from stages.hardware.device import processors
 from stages.hardware.memory import at_once
 from stages.io.photos import Photo, spread
@@ -35,6 +36,7 @@ FISHEYE_ANGLE_DEG = 150.0
 # Of the maximum: where the median of so many photos has fewer, photos are enlarged (docs/experiments/few_features.md).
 MIN_FEATURES_SHARE, COUNTED_PHOTOS = 0.25, 12
 BYTES_PER_PIXEL = 100  # 77 to 86 measured on photos of 1024 to 3200 pixels
+PHOTOS_AT_A_TIME = 2  # of a cluster's core: to make a database for them takes a twentieth of a second
 OPENINGS, PAUSE_SECONDS = 50, 0.1  # a reader holds the lock for milliseconds
 CACHED_PHOTOS = 256  # whose features are held in memory, about half a megabyte each
 
@@ -186,14 +188,49 @@ def _copy_features(source: Path, target: Path, numbers: Sequence[int]) -> None:
                 written.write_descriptors(image_id, read.read_descriptors(own_id))
 
 
+Extracted = tuple[np.ndarray, pycolmap.FeatureDescriptors]
+"""Keypoints and descriptors of a photo as COLMAP writes them."""
+
+
 def _extract(database: Path, images: Path, photos: Sequence[Photo], extraction: ExtractionOptions) -> None:
     """The features of these photos, whatever they yield. Those of photos that have some are left alone."""
+
+    def here(work: object, groups: object) -> Iterable[list[Extracted]]:
+        _extract_here(database, images, photos, extraction, at_once(processors(), feature_bytes(photos, extraction)))
+        return ()  # COLMAP has written them itself
+
     if not photos:
         return
+    with pycolmap.Database.open(database) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        todo = [photo for photo in photos if not db.exists_descriptors(ids[photo.image_name])]
+        groups = [todo[begin : begin + PHOTOS_AT_A_TIME] for begin in range(0, len(todo), PHOTOS_AT_A_TIME)]
+        extracted = cluster.fan_out(partial(_extract_apart, images, extraction), groups, here)
+        for group, found in zip(groups, extracted, strict=False):
+            with pycolmap.DatabaseTransaction(db):
+                for photo, (keypoints, descriptors) in zip(group, found, strict=True):
+                    db.write_keypoints(ids[photo.image_name], keypoints)
+                    db.write_descriptors(ids[photo.image_name], descriptors)
+
+
+def _extract_apart(images: Path, extraction: ExtractionOptions, photos: Sequence[Photo]) -> list[Extracted]:
+    """The features of these photos by a database of their own, on one core."""
+    with tempfile.TemporaryDirectory() as folder:
+        database = Path(folder, "apart.db")
+        fill_database(database, photos, MAPPING_MODEL)
+        _extract_here(database, images, photos, extraction, threads=1)
+        with pycolmap.Database.open(database) as db:
+            numbers = range(1, len(photos) + 1)
+            return [(np.array(db.read_keypoints(number)), db.read_descriptors(number)) for number in numbers]
+
+
+def _extract_here(
+    database: Path, images: Path, photos: Sequence[Photo], extraction: ExtractionOptions, threads: int
+) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = extraction.max_image_size
     options.sift.max_num_features = extraction.max_features
-    options.num_threads = at_once(processors(), feature_bytes(photos, extraction))
+    options.num_threads = threads
     small = {photo.image_name for photo in photos if extraction.doubles(photo)}
     masks = extraction.masks
     masked = {p.image_name for p in photos if masks and (masks / f"{p.image_name}.png").is_file()}
@@ -227,26 +264,20 @@ def match_pairs(
     features are compared, exactly without it, and keeps those that were read for further calls. ``on_expected`` is
     told how many pairs there are to match and how long it will take, once a first block, spread over all, is done.
     """
-    options = _verification(seed)
     with pycolmap.Database.open(database) as db, ThreadPoolExecutor(processors()) as pool:
         todo = _spread([(i, j) for i, j in pairs.tolist() if not db.exists_two_view_geometry(i + 1, j + 1)])
         photo = partial((features or Features()).read, db)
-        blocks = [todo[begin : begin + BLOCK_SIZE] for begin in range(0, len(todo), BLOCK_SIZE)]
-        started, work = time.monotonic(), []
-        for number in range(len(blocks) + 1):
-            ahead = [
-                pool.submit(_match, photo(i), photo(j), max_ratio, options)
-                for i, j in (blocks[number] if number < len(blocks) else [])
-            ]  # at work while those before are written
+        every = [todo[begin : begin + BLOCK_SIZE] for begin in range(0, len(todo), BLOCK_SIZE)]
+        blocks = ([(photo(i), photo(j)) for i, j in block] for block in every)
+        matched = cluster.fan_out(partial(_match_block, max_ratio, seed), blocks, partial(_match_here, pool))
+        started = time.monotonic()
+        for number, (block, found) in enumerate(zip(every, matched, strict=True)):
             with pycolmap.DatabaseTransaction(db):
-                for (i, j), (matches, geometry) in zip(
-                    blocks[number - 1] if number else [], (each.result() for each in work), strict=True
-                ):
+                for (i, j), (matches, geometry) in zip(block, found, strict=True):
                     db.write_matches(i + 1, j + 1, matches)
                     db.write_two_view_geometry(i + 1, j + 1, geometry)
-            work = ahead
-            if number == 1:
-                on_expected(len(todo), (time.monotonic() - started) * len(todo) / len(blocks[0]))
+            if number == 0:
+                on_expected(len(todo), (time.monotonic() - started) * len(todo) / len(block))
 
 
 def _spread(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -263,23 +294,26 @@ class _Photo(NamedTuple):
     features: Any  # descriptors, (keypoints, 128) bytes, or IndexedFeatures of them
 
 
+SharedPhoto = Callable[[], _Photo]
+
+
 class Features:
     """Photos' features as they are compared: exactly, or with ``words`` by an inverted file, which takes a fifth of the
     time and misses two matches in a hundred. The latest CACHED_PHOTOS are kept."""
 
     def __init__(self, words: Words | None = None) -> None:
         self._words = words
-        self._photos: dict[int, _Photo] = {}
+        self._photos: dict[int, SharedPhoto] = {}
 
-    def read(self, db: pycolmap.Database, photo: int) -> _Photo:
-        """Those of the photo with this number."""
+    def read(self, db: pycolmap.Database, photo: int) -> SharedPhoto:
+        """Those of the photo with this number, for work anywhere."""
         if (found := self._photos.pop(photo, None)) is None:
             camera = db.read_camera(db.read_image(photo + 1).camera_id)
             keypoints = np.array(db.read_keypoints(photo + 1), float).reshape(-1, 6)
             features: Any = read_descriptors(db, photo)
             if self._words is not None:
                 features = index_features(features, self._words)
-            found = _Photo(camera, keypoints[:, :2], features)
+            found = cluster.share(_Photo(camera, keypoints[:, :2], features))
         self._photos[photo] = found  # the latest last
         if len(self._photos) > CACHED_PHOTOS:
             del self._photos[next(iter(self._photos))]
@@ -318,10 +352,29 @@ def read_descriptors(db: pycolmap.Database, photo: int) -> np.ndarray:
     return np.array(db.read_descriptors(photo + 1).data, np.uint8).reshape(-1, 128)
 
 
-def _match(
-    first: _Photo, second: _Photo, max_ratio: float, options: pycolmap.TwoViewGeometryOptions
-) -> tuple[np.ndarray, pycolmap.TwoViewGeometry]:
-    """Matches, and the geometry of two views with those that it explains: none where they are too few."""
+Block = list[tuple[SharedPhoto, SharedPhoto]]
+Matched = tuple[np.ndarray, pycolmap.TwoViewGeometry]
+"""Matches, and the geometry of two views with those that it explains: none where they are too few."""
+
+
+def _match_here(
+    pool: ThreadPoolExecutor, work: Callable[[Block], list[Matched]], blocks: Iterable[Block]
+) -> Iterator[list[Matched]]:
+    """Each block on all cores, at work while the one before is written."""
+    before = list[Future[list[Matched]]]()
+    for block in chain(blocks, [Block()]):
+        ahead = [pool.submit(work, [pair]) for pair in block]
+        if before:
+            yield [found for each in before for found in each.result()]
+        before = ahead
+
+
+def _match_block(max_ratio: float, seed: int, block: Block) -> list[Matched]:
+    options, photos = _verification(seed), {each: each() for pair in block for each in pair}
+    return [_match(photos[first], photos[second], max_ratio, options) for first, second in block]
+
+
+def _match(first: _Photo, second: _Photo, max_ratio: float, options: pycolmap.TwoViewGeometryOptions) -> Matched:
     match: Any = match_indexed if isinstance(first.features, IndexedFeatures) else match_descriptors
     matches = match(first.features, second.features, max_ratio)
     return matches, _verified(first, second, matches, options)
@@ -408,7 +461,7 @@ def verify_again(db: pycolmap.Database, seed: int) -> None:
     photo, options = partial(Features().read, db), _verification(seed)
     for pair_id, matches in zip(*db.read_all_matches(), strict=True):
         first, second = pycolmap.pair_id_to_image_pair(pair_id)
-        geometry = _verified(photo(first - 1), photo(second - 1), np.asarray(matches, np.uint32), options)
+        geometry = _verified(photo(first - 1)(), photo(second - 1)(), np.asarray(matches, np.uint32), options)
         db.delete_two_view_geometry(first, second)
         db.write_two_view_geometry(first, second, geometry)
 

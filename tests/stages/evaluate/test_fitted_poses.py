@@ -52,7 +52,7 @@ def test_fitted_poses_are_scored_at_the_photos_exposure(tmp_path: Path, monkeypa
     neutral = Renderer(AppearanceModel(field, (ExposureModel(torch.full((1, 3), 0.3)),)), torch.zeros(3))
     reader = PhotoReader(inputs["ingest"], scene, 1.0)
     scorer = scoring.Scorer(scene, inputs["ingest"], neutral, info, True, None, 1.0, reader, reader)
-    scored = scoring.score(scorer, tmp_path, SilentDisplay()).images[0]
+    scored = scoring.score(scorer, tmp_path, SilentDisplay(), lambda: scorer).images[0]
     rays = view_rays(scene, view, 1.0)
     exposed = neutral.through(photo_effects(info, scene, view))
     assert given[0][0] is field and torch.equal(given[0][1], exposed.render(rays).colour)

@@ -152,6 +152,16 @@ def test_however_the_child_ends_it_is_an_error_with_words(
     assert (tmp_path / "sfm.log").exists()
 
 
+def test_an_error_of_the_child_arrives_as_it_was(
+    inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lost = "StageError('hardware.cluster-lost', 'the cluster is gone', 'it is silent', 'Resume.')"
+    code = f"import stages.sfm.worker as c\nc.reconstruct = lambda *_: (_ for _ in ()).throw(c.{lost})\nc.main()"
+    monkeypatch.setattr(worker_process, "COMMAND", ["-c", code])
+    with refused("hardware.cluster-lost", "gone", "silent", "Resume."):
+        run_stage(sfm, SMALL, inputs, tmp_path / "sfm", progress)
+
+
 def test_strangers_are_named_alpha_and_mixed_sizes_work(inputs: dict[str, Path], tmp_path: Path, progress) -> None:
     images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:8]}
     alpha = {f"{n}.png": np.dstack([i, np.full(i.shape[:2], 255, np.uint8)]) for n, i in list(images.items())[:6]}

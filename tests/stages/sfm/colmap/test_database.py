@@ -10,9 +10,11 @@ import pytest
 from PIL import Image
 
 import stages.sfm.colmap.database as database_module
+from stages.hardware import cluster
 from stages.io.photos import Photo
 from stages.sfm.colmap.database import (
     ExtractionOptions,
+    Features,
     extract_features,
     fill_database,
     image_similarity,
@@ -105,6 +107,19 @@ def test_the_number_of_cores_changes_nothing(database: Path, monkeypatch: pytest
         match_pairs(copy, exhaustive(COUNT), 0, 0.8)
         results.append(found(copy))
     assert results[0] == results[1]
+
+
+@pytest.mark.parametrize("words", [None, np.random.default_rng(1).integers(0, 60, (8, 128)).astype(np.float32)])
+def test_a_cluster_finds_the_same_matches(
+    words: np.ndarray | None, database: Path, ray_cluster: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(database_module, "BLOCK_SIZE", 4)
+    here = copy_of(database, "here.db")
+    match_pairs(here, exhaustive(COUNT), 0, 0.8, features=Features(words))
+    monkeypatch.setattr(database_module, "_match_here", lambda *_: pytest.fail("matched here"))
+    with cluster.joined(ray_cluster):
+        match_pairs(database, exhaustive(COUNT), 0, 0.8, features=Features(words))
+    assert list(found(here)) == PAIRS and found(database) == found(here)
 
 
 def test_only_what_is_missing_is_matched(database: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,6 +239,29 @@ def test_photos_are_enlarged_where_most_yield_few_features(
         assert all(len(own) < 100 < 400 < len(more) for own, more in zip(own_size[busy:], found[busy:], strict=True))
     else:
         assert all(np.array_equal(own, same) for own, same in zip(own_size, found, strict=True))
+
+
+def test_a_cluster_extracts_the_same_features(
+    tmp_path: Path, ray_cluster: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos, masks = pictures(tmp_path, 4, 0), tmp_path / "masks"
+    masks.mkdir()
+    Image.fromarray(np.repeat(np.uint8([0, 255]), 240)[None].repeat(360, 0)).save(masks / "1.png.png")
+    monkeypatch.setattr(database_module, "COUNTED_PHOTOS", 1)
+
+    def extracted(name: str) -> list[bytes]:
+        database = tmp_path / f"{name}.db"
+        fill_database(database, photos, "SIMPLE_RADIAL")
+        extract_features(database, tmp_path, photos, ASKED._replace(masks=masks))
+        with pycolmap.Database.open(database) as db:
+            return [
+                db.read_keypoints(i).tobytes() + np.array(db.read_descriptors(i).data).tobytes() for i in range(1, 5)
+            ]
+
+    here = extracted("here")
+    with cluster.joined(ray_cluster):
+        assert extracted("there") == here
+    assert 0 < len(here[1]) < len(here[0]), "masked"
 
 
 def test_extraction_that_was_interrupted_goes_on(tmp_path: Path) -> None:
