@@ -1,4 +1,4 @@
-"""What a stage takes on a Ray cluster that is this machine alone, and without one, and whether its outputs are the same.
+"""What a stage takes on a Ray cluster that is this machine alone, and without one, and whether its outputs agree.
 
     ray start --head; python -m benchmarks.cluster PHOTOS [--stage sfm] [--repeats 3] [--kills 10] [--cluster auto]
 
@@ -32,8 +32,8 @@ WORKING = "ray::_do"  # the title of a process at a piece of work
 
 @contextmanager
 def killing(shortest: float = 1.0, longest: float = 8.0) -> Iterator[list[int]]:
-    """Meanwhile a process at work for the cluster is killed after each random pause of so many seconds, at most as often
-    as one piece of work is begun again; their ids."""
+    """Meanwhile a process at work for the cluster is killed after each random pause of so many seconds, at most as
+    often as one piece of work is begun again; their ids."""
     killed, over, pauses = list[int](), threading.Event(), random.Random(0)
 
     def kill() -> None:

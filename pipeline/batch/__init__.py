@@ -1,12 +1,14 @@
 """`pipeline batch`: every scene of a folder by a `pipeline run` of its own, and one page that ranks the results.
 
-What is known of the scenes is in batch.json, written before and after each run; the same command goes on from there.
+Scenes run one after another, or one on each machine of a cluster. What is known of them is in batch.json, written
+before and after each run; the same command goes on from there.
 """
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -14,10 +16,11 @@ from filelock import FileLock, Timeout
 from pipeline.batch import batch_file
 from pipeline.batch.batch_file import BatchFile, SceneFailure, SceneState
 from pipeline.batch.page import PAGE, write_page
-from pipeline.batch.scene_run import figures_of, run_scene
+from pipeline.batch.scene_run import Ending, SceneRun, figures_of, run_scene
 from pipeline.batch.scenes import Scene, printable
 from pipeline.engine.display import Display
 from stages.contract import StageError
+from stages.hardware import cluster
 from stages.io.amounts import duration
 
 MIN_SECONDS = 1.0  # of the budget, for a scene to be begun
@@ -26,13 +29,15 @@ MIN_SECONDS = 1.0  # of the budget, for a scene to be begun
 @dataclass(frozen=True)
 class Batch:
     """Scenes of the folder ``of``, and where their workspaces go: ``folder``/NAME.nerf, NAME.log beside it. Each run is
-    given the ``options``; ``budget`` is seconds for all runs, None without a limit."""
+    given the ``options``; ``budget`` is seconds for all runs, None without a limit. ``cluster`` is the address of the
+    one that runs them, None: this machine."""
 
     of: Path
     scenes: Sequence[Scene]
     folder: Path
     options: Sequence[str]
     budget: float | None
+    cluster: str | None = None
 
     def workspace(self, name: str) -> Path:
         return self.folder / f"{name}.nerf"
@@ -60,7 +65,7 @@ def run_batch(batch: Batch, display: Display) -> int:
         raise StageError("pipeline.batch-in-use", what, why, hint) from None
     except OSError as error:
         raise _cannot_write(batch, error) from error
-    with lock:
+    with lock, cluster.joined(batch.cluster, [batch.folder, batch.of, Path.cwd()]):
         return _run_all(batch, display)
 
 
@@ -73,9 +78,13 @@ def _cannot_write(batch: Batch, error: OSError) -> StageError:
 def _run_all(batch: Batch, display: Display) -> int:
     state = _continued(batch, batch_file.read(batch.folder))
     limit = "" if batch.budget is None else f" · {duration(batch.budget)} for all"
-    display.headline(f"{len(state.scenes)} scenes · results in {batch.folder}{limit}")
-    for scene in batch.scenes:
-        _run_one(batch, state, scene, display)
+    words = [f"{len(state.scenes)} scenes", f"results in {batch.folder}{limit}", *cluster.described()]
+    display.headline(" · ".join(words))
+    here = partial(_run_here, batch, state, display)
+    for ending in cluster.fan_out(run_scene, _begun(batch, state, display), here, "machine"):
+        if batch.cluster is not None:
+            display.begin(ending.name)  # several run at a time, which a live line has no room for
+        _end(batch, state, ending, display)
     failed = [name for name, scene in state.scenes.items() if scene.state == "failed"]
     done = len(state.scenes) - len(failed)
     text = f"{done} of {len(state.scenes)} scenes are done" + (f"; failed: {', '.join(failed)}" if failed else "")
@@ -97,42 +106,52 @@ def _continued(batch: Batch, before: BatchFile) -> BatchFile:
     return BatchFile(folder=printable(os.path.abspath(batch.of)), budget=batch.budget, scenes=scenes)
 
 
-def _run_one(batch: Batch, state: BatchFile, scene: Scene, display: Display) -> None:
-    own = state.scenes[scene.name]
-    own.allocated, own.state = state.allocated(scene.name), "running"
-    display.begin(scene.name)
-    began, spent, last = time.monotonic(), own.spent, ""
-    if own.allocated is not None and own.allocated < MIN_SECONDS:
-        what, why = "not begun", "the other scenes have used up the budget"
-        hint = "Give the same command with a larger --budget: finished scenes are kept."
-        own.failure = SceneFailure(stage=None, code="pipeline.no-time-left", what=what, why=why, hint=hint)
-        own.allocated = None
-    else:
+def _begun(batch: Batch, state: BatchFile, display: Display) -> Iterator[SceneRun]:
+    """Each scene as it begins; those that no time is left for have failed."""
+    at_once = cluster.at_once("machine")
+    for scene in batch.scenes:
+        own = state.scenes[scene.name]
+        own.allocated, own.state = state.allocated(scene.name, at_once), "running"
+        if own.allocated is not None and own.allocated < MIN_SECONDS:
+            what, why = "not begun", "the other scenes have used up the budget"
+            hint = "Give the same command with a larger --budget: finished scenes are kept."
+            failure = SceneFailure(stage=None, code="pipeline.no-time-left", what=what, why=why, hint=hint)
+            own.allocated = None
+            display.begin(scene.name)
+            _end(batch, state, Ending(scene.name, "", failure, 0.0), display)
+            continue
         _write(batch, state)
+        limit = () if own.allocated is None else ("--budget", f"{own.allocated:.0f}s")
+        arguments = (str(scene.photos), *batch.options, *limit, "-o", str(batch.workspace(scene.name)))
+        yield SceneRun(scene.name, arguments, batch.log(scene.name), Path.cwd())
+
+
+def _run_here(
+    batch: Batch, state: BatchFile, display: Display, work: Callable[..., Ending], runs: Iterable[SceneRun]
+) -> Iterator[Ending]:
+    for run in runs:
+        display.begin(run.name)
+        began = time.monotonic()
         try:
-            last, own.failure = _run(batch, scene, own.allocated, display)
-        finally:
-            own.spent = round(spent + time.monotonic() - began, 1)
+            ending = work(run, follow=display.update)
+        except BaseException:
+            state.scenes[run.name].spent += round(time.monotonic() - began, 1)
             _write(batch, state)
-    own.state = "failed" if own.failure else "done"
-    if own.failure:
-        display.failed(scene.name, _as_error(own.failure))
+            raise
+        yield ending
+
+
+def _end(batch: Batch, state: BatchFile, ending: Ending, display: Display) -> None:
+    own = state.scenes[ending.name]
+    own.spent = round(own.spent + ending.seconds, 1)
+    own.failure, own.state = ending.failure, "failed" if ending.failure else "done"
+    if ending.failure:
+        display.failed(ending.name, _as_error(ending.failure))
     else:
-        own.figures = figures_of(batch.workspace(scene.name))
-        own.line = _line(own) or last
-        display.end(scene.name, own.line, time.monotonic() - began, cached=False)
+        own.figures = figures_of(batch.workspace(ending.name))
+        own.line = _line(own) or ending.line
+        display.end(ending.name, own.line, ending.seconds, cached=False)
     _write(batch, state)
-
-
-def _run(batch: Batch, scene: Scene, seconds: float | None, display: Display) -> tuple[str, SceneFailure | None]:
-    limit = () if seconds is None else ("--budget", f"{seconds:.0f}s")
-    arguments = (str(scene.photos), *batch.options, *limit, "-o", str(batch.workspace(scene.name)))
-    try:
-        return run_scene(arguments, batch.log(scene.name), display.update)
-    except OSError as error:
-        hint = "Give the same command again; what is finished is kept."
-        why = error.strerror or str(error)
-        return "", SceneFailure(stage=None, code="pipeline.scene-not-run", what="cannot run it", why=why, hint=hint)
 
 
 def _write(batch: Batch, state: BatchFile) -> None:

@@ -48,8 +48,8 @@ class BatchFile(BaseModel):
     budget: float | None = None
     scenes: dict[str, SceneState] = {}
 
-    def allocated(self, name: str) -> float | None:
-        """Seconds of the budget for a scene; None without one.
+    def allocated(self, name: str, at_once: int = 1) -> float | None:
+        """Seconds of the budget for a scene, ``at_once`` of which run at a time; None without one.
 
         Scenes that wait share what the others leave, which may be nothing. One that was interrupted or is done keeps
         what it was given, for with another budget it would choose other settings."""
@@ -59,7 +59,7 @@ class BatchFile(BaseModel):
             return given
         others = self.scenes.values()
         used = sum(max(one.allocated or 0.0, one.spent) if one.state == "running" else one.spent for one in others)
-        return (self.budget - used) / sum(one.allocated is None for one in others)
+        return (self.budget - used / at_once) * min(1.0, at_once / sum(one.allocated is None for one in others))
 
 
 def read(folder: Path) -> BatchFile:

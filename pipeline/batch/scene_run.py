@@ -5,32 +5,65 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 from pipeline.batch.batch_file import SceneFailure
 from stages.hardware.child_process import child_environment
 
 COMMAND = ["-P", "-m", "pipeline.cli.attended", "run"]  # -P: nothing in the current folder is taken for a module
 NO_REASON = {"why": "an option is wrong", "hint": "Correct it, and give the command again."}  # of a usage error
+ENDING_SECONDS = 120.0  # until a run whose parent was killed has ended, and its lock is free on shared storage, too
 FIGURES = ("photos", "registered", "psnr", "ssim", "cameras_doubtful")
 
 
-def run_scene(
-    arguments: Sequence[str], log: Path, follow: Callable[[str, float | None], None]
-) -> tuple[str, SceneFailure | None]:
-    """Run `pipeline run` with ``arguments``; its last finished stage in a line, and why it failed (None: it did not).
+class SceneRun(NamedTuple):
+    """A scene to run: its name, the arguments of its `pipeline run`, the log, and the folder to run in."""
 
-    What it says goes to ``log``; ``follow`` gets its live line and the finished fraction of the stage. Where this
-    process is interrupted, the run is, too, and has ended when the exception goes on."""
+    name: str
+    arguments: tuple[str, ...]
+    log: Path
+    at: Path
+
+
+class Ending(NamedTuple):
+    """How a scene ended: its last finished stage in a line, why it failed (None: it did not), seconds that it took."""
+
+    name: str
+    line: str
+    failure: SceneFailure | None
+    seconds: float
+
+
+def run_scene(run: SceneRun, follow: Callable[[str, float | None], None] = lambda line, done: None) -> Ending:
+    """Run a scene. What it says goes to its log; ``follow`` gets its live line and the finished fraction of the stage.
+    Where this process is interrupted, the run is, too, and has ended when the exception goes on. Where another one was
+    killed with the same scene, its run ends by itself in a moment, which is waited for."""
+    began = time.monotonic()
+    while True:
+        try:
+            line, failure = _run(run, follow)
+        except OSError as error:
+            hint = "Give the same command again; what is finished is kept."
+            why = error.strerror or str(error)
+            line = ""
+            failure = SceneFailure(stage=None, code="pipeline.scene-not-run", what="cannot run it", why=why, hint=hint)
+        seconds = time.monotonic() - began
+        if failure is None or failure.code != "pipeline.workspace-in-use" or seconds > ENDING_SECONDS:
+            return Ending(run.name, line, failure, seconds)
+        time.sleep(1.0)
+
+
+def _run(run: SceneRun, follow: Callable[[str, float | None], None]) -> tuple[str, SceneFailure | None]:
+    log = run.log
     last, failure = "", None
     with log.open("a", encoding="utf-8", errors="backslashreplace") as text:
-        text.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} pipeline run {' '.join(arguments)}\n")
+        text.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} pipeline run {' '.join(run.arguments)}\n")
         text.flush()
         began = text.tell()
-        with _started(arguments, text) as child:
+        with _started(run, text) as child:
             assert child.stdout
             for event in map(_event, child.stdout):
                 if event["event"] == "progress":
@@ -51,9 +84,10 @@ def run_scene(
 
 
 @contextmanager
-def _started(arguments: Sequence[str], log: IO[str]) -> Iterator["subprocess.Popen[str]"]:
+def _started(run: SceneRun, log: IO[str]) -> Iterator["subprocess.Popen[str]"]:
     child = subprocess.Popen(
-        [sys.executable, *COMMAND, *arguments, "--json"],
+        [sys.executable, *COMMAND, *run.arguments, "--json"],
+        cwd=run.at,
         stdin=subprocess.PIPE,  # open as long as this process lives
         stdout=subprocess.PIPE,
         stderr=log,

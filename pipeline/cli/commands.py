@@ -193,14 +193,17 @@ def command_batch(words: Sequence[str]) -> int:
     folder = given.output or Path.cwd() / f"{given.scenes.absolute().name}.batch"
     if given.output is None and (other := other_folder(folder, given.scenes)):
         raise UsageError(f"{folder.name} was made from {other}, not from {given.scenes}; give another folder with -o")
-    batch = Batch(given.scenes, find_scenes(given.scenes), folder, _options_of_each(words[1:]), budget)
+    scenes, address = given.scenes, given.common.cluster
+    if address is not None:
+        scenes, folder = scenes.absolute(), folder.absolute()  # machines of a cluster work in folders of their own
+    batch = Batch(scenes, find_scenes(scenes), folder, _options_of_each(words[1:]), budget, address)
     with choose_display(given.common.json) as display:
         return exit_codes.BATCH if run_batch(batch, display) else 0
 
 
 def _options_of_each(words: Sequence[str]) -> list[str]:
     """The options of a batch's command line that each of its runs is given: not those that are the batch's own."""
-    own, each = ("-o", "--output", "--budget"), list[str]()
+    own, each = ("-o", "--output", "--budget", "--cluster"), list[str]()
     rest = iter(words)
     for word in rest:
         if word in own:

@@ -146,15 +146,20 @@ def fan_out(
 
 def share(value: Result) -> Callable[[], Result]:
     """What gives a value that many items need, here and in work. Each machine fetches it once; its processes have the
-    arrays in it, read-only, in common."""
-    return (lambda: value) if _joined is None else partial(_fetch, _joined.ray.put(value))
+    arrays in it, read-only, in common. Raises StageError where the cluster is gone."""
+    if _joined is None:
+        return lambda: value
+    try:
+        return partial(_fetch, _joined.ray.put(value))
+    except _joined.ray.exceptions.RayError as error:
+        raise _lost(_joined) from error
 
 
 def _numbered(
     cluster: Cluster, work: Callable[[Item], Result], items: Iterable[Item], place: Place
 ) -> Iterator[tuple[int, Result]]:
     """Every result as soon as it is there, with the place of its item among all."""
-    task, shared, limit = _task(cluster, place), [cluster.ray.put(work)], cluster.at_once(place)
+    task, shared, limit = _task(cluster, place), share(work), cluster.at_once(place)
     pending, coming, number, left = dict[Any, int](), iter(items), 0, True
     try:
         while left or pending:
@@ -216,12 +221,12 @@ def _lost(cluster: Cluster) -> StageError:
 _work: tuple[str, Any] | None = None  # the latest, with what it has cached
 
 
-def _do(shared: list[Any], item: Any) -> Any:
+def _do(shared: Any, item: Any) -> Any:
     """A piece of work; its function is fetched by each process once."""
     global _work
-    reference = shared[0]
-    if _work is None or _work[0] != reference.hex():
-        _work = reference.hex(), _fetch(reference)
+    name = shared.args[0].hex()
+    if _work is None or _work[0] != name:
+        _work = name, shared()
     return _work[1](item)
 
 

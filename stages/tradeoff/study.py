@@ -1,15 +1,18 @@
 """A study from plan to recommendation: choose its runs, train and score them one by one, write what was found."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from statistics import mean, stdev
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from nerf.geometry.scene import Scene
-from stages.contract import Inputs, Progress, StageError, StageResult
+from stages.contract import Inputs, Progress, SilentProgress, StageError, StageResult
 from stages.effects.decisions import read_decisions
 from stages.evaluate.tiles import MIN_TILES, TILE_SIZE
+from stages.hardware.cluster import fan_out
 from stages.io.amounts import duration, resolution_name
 from stages.io.files import read_scene, write_json
 from stages.io.stopwatch import counting
@@ -148,25 +151,32 @@ def run_study(config: "Config", inputs: Inputs, folder: Path, progress: Progress
         StageError: without test photos, where not one run could be scored, or where one could not be trained for
             want of memory or disk.
     """
-    assert config.tiles and config.sizes, "plan() chooses them"
-    scene, schedule, runs = _scene_with_test_photos(inputs), schedule_of(config), folder / "runs"
+    schedule, runs = schedule_of(config), folder / "runs"
     for line in schedule_lines(schedule, config.seconds, runs):
         progress.note("tradeoff.schedule", line)
     with counting(folder / "clock.json") as spent:
-        benchmark = make_benchmark(inputs["ingest"], scene, config.downscale, config.tiles, config.sizes[-1])
-        results, late = list[Result](), list[Run]()
-        slowness = 1.0
-        for number, run in enumerate(schedule.runs, 1):
-            too_late = spent() + run.seconds * slowness > (1 + MAX_LATE) * config.seconds
-            # The first one is made in any case: whatever killed attempts took, asking again helps.
-            if results and too_late and read_figures(figures_file(run, runs)) is None:
-                late.append(run)
-                continue
-            place = f"{number}/{len(schedule.runs)}"
-            inner = _RunProgress(progress, f"{place} {run.variant}", spent() / config.seconds)
-            results.append(Result(run, train_and_score(run, benchmark, inputs, runs, inner)))
+        benchmark = _benchmark(config, inputs)
+        places = {run: f"{number}/{len(schedule.runs)}" for number, run in enumerate(schedule.runs, 1)}
+        results, late, slowness = list[Result](), list[Run](), 1.0
+
+        def affordable() -> Iterator[Run]:
+            for run in schedule.runs:
+                too_late = spent() + run.seconds * slowness > (1 + MAX_LATE) * config.seconds
+                # The first one is made in any case: whatever killed attempts took, asking again helps.
+                if results and too_late and read_figures(figures_file(run, runs)) is None:
+                    late.append(run)
+                else:
+                    yield run
+
+        def here(work: object, chosen: Iterable[Run]) -> Iterator[Result]:
+            for run in chosen:
+                inner = _RunProgress(progress, f"{places[run]} {run.variant}", spent() / config.seconds)
+                yield Result(run, train_and_score(run, benchmark, inputs, runs, inner))
+
+        for result in fan_out(RunApart(config, dict(inputs), runs), affordable(), here, "machine"):
+            results.append(result)
             slowness = sum(r.figures["wall_seconds"] for r in results) / sum(r.run.seconds for r in results)
-            progress.note("tradeoff.result", f"{place} {_result_line(results[-1])}")
+            progress.note("tradeoff.result", f"{places[result.run]} {_result_line(result)}")
         if late:
             why = "this machine is slower than when it was measured" if slowness > 1 else "no time is left"
             progress.note("tradeoff.not-trained", f"{why}; not trained: {'; '.join(list_runs(late))}")
@@ -177,6 +187,30 @@ def run_study(config: "Config", inputs: Inputs, folder: Path, progress: Progress
         why = why or f"even {schedule.left_out[0]} takes longer than {duration(config.seconds)} here"
         raise StageError("tradeoff.no-result", "the study has no result", why, "Give it more time, e.g. --budget 30m.")
     return Outcome(results, (*schedule.left_out, *list_runs(late), *failed), existing, benchmark)
+
+
+@dataclass(frozen=True)
+class RunApart:
+    """Makes runs of a study with these planned options on a machine of a cluster."""
+
+    config: "Config"
+    inputs: Inputs
+    runs: Path
+
+    @cached_property
+    def benchmark(self) -> Benchmark:
+        """What they are scored on."""
+        return _benchmark(self.config, self.inputs)
+
+    def __call__(self, run: Run) -> Result:
+        """Train and score it."""
+        return Result(run, train_and_score(run, self.benchmark, self.inputs, self.runs, SilentProgress()))
+
+
+def _benchmark(config: "Config", inputs: Inputs) -> Benchmark:
+    assert config.tiles and config.sizes, "plan() chooses them"
+    scene = _scene_with_test_photos(inputs)
+    return make_benchmark(inputs["ingest"], scene, config.downscale, config.tiles, config.sizes[-1])
 
 
 def _result_line(result: Result) -> str:

@@ -10,7 +10,9 @@ from stages.contract import run_stage
 from stages.evaluate import tiles
 from stages.hardware import cluster
 from stages.io.files import read_scene
-from stages.tradeoff import benchmark
+from stages.tradeoff import Config, benchmark
+from stages.tradeoff.schedule import REDUCED, Run
+from stages.tradeoff.study import RunApart
 from stages.train.fields.hash_grid_options import HashGridOptions
 from tests.stages.photo_scene import photographed
 
@@ -46,3 +48,20 @@ def test_a_cluster_scores_the_same(tmp_path: Path, progress: Any, ray_cluster: s
     with cluster.joined(ray_cluster, [tmp_path]):
         assert scored("there") == here
     assert progress.updates[-1] == ("test photo 2 of 2", 1.0) and len(here) == 1 + 2 * 2
+
+
+def test_a_cluster_makes_the_same_runs(tmp_path: Path, ray_cluster: str) -> None:
+    photos, _ = photographed(tmp_path / "photos", channels=4)
+    config = Config(seconds=60, downscale=1.0, sizes=(1.0,), tiles=2)
+    runs = [Run(REDUCED, "bounded", 1.0, 2, seed, 1.0) for seed in range(2)]
+
+    def scores(name: str) -> list[tuple[Run, float]]:
+        folder = tmp_path / name
+        folder.mkdir()
+        made = cluster.fan_out(RunApart(config, photos, folder), runs, place="machine")
+        return [(run, figures["psnr"]) for run, figures in made]
+
+    here = scores("here")
+    with cluster.joined(ray_cluster, [tmp_path]):
+        assert scores("there") == here
+    assert [run for run, _ in here] == runs and len({psnr for _, psnr in here}) == 2

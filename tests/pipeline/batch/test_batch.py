@@ -76,6 +76,22 @@ def test_one_bad_scene_stops_nothing(scenes: Path, tmp_path: Path, capsys: pytes
     assert len(before) == 2
 
 
+def test_a_cluster_runs_all_scenes_but_the_bad_one(
+    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], ray_cluster: str
+):
+    out = tmp_path / "out"
+    words = ["batch", str(scenes), "-o", str(out), "--json", "--budget", "1h", "--cluster", ray_cluster, *ONLY_INGEST]
+    assert run_command(words) == exit_codes.BATCH
+    assert states(out) == {HOSTILE: "done", "bad": "failed", "z": "done"}
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [event["stage"] for event in events if event["event"] == "end"] == [HOSTILE, "z"]
+    known = batch_file.read(out).scenes
+    assert (failure := known["bad"].failure) and failure.stage == "ingest" and failure.code.startswith("ingest.")
+    assert [known[name].allocated for name in (HOSTILE, "bad")] == [2400, 2400], "two machines, three scenes"
+    assert all(scene.spent > 0 for scene in known.values())
+    assert all((out / f"{name}.log").stat().st_size > 0 for name in known)
+
+
 def test_a_page_shows_figures_links_and_a_picture(tmp_path: Path):
     known = batch_file.BatchFile(
         scenes={
@@ -159,7 +175,7 @@ def test_usage_errors_come_before_any_scene(words: list[str], tmp_path: Path, mo
 
 def ends_by(script: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> batch_file.SceneFailure | None:
     monkeypatch.setattr(scene_run, "COMMAND", ["-c", script])
-    return scene_run.run_scene((), tmp_path / "log", lambda message, done: None)[1]
+    return scene_run.run_scene(scene_run.SceneRun("a", (), tmp_path / "log", tmp_path)).failure
 
 
 def test_a_crash_is_told_by_its_signal_or_last_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -42,6 +42,14 @@ def test_what_a_failed_attempt_took_is_spent():
     assert batch(a=done(40), b=waiting(spent=20), c=waiting()).allocated("b") == pytest.approx(15)
 
 
+def test_scenes_at_the_same_time_share_the_machines_time():
+    started = SceneState(photos="p", state="running", allocated=45)
+    assert batch(a=waiting(), b=waiting(), c=waiting(), d=waiting()).allocated("a", 2) == pytest.approx(45)
+    assert batch(a=started, b=waiting(), c=waiting(), d=waiting()).allocated("b", 2) == pytest.approx(45)
+    assert batch(a=done(20), b=started, c=waiting(), d=waiting()).allocated("c", 2) == pytest.approx((180 - 65) / 2)
+    assert batch(a=started, b=started, c=waiting()).allocated("c", 2) == pytest.approx(45), "not more than is left"
+
+
 def test_without_a_budget_nothing_is_allocated():
     assert BatchFile(scenes={"a": done(5)}).allocated("a") is None
 

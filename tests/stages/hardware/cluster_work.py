@@ -35,3 +35,10 @@ def die(item: int) -> int:
 def wait(seconds: float) -> None:
     """Takes that long."""
     time.sleep(seconds)
+
+
+def stay(folder: Path, item: int) -> None:
+    """Says which process it is in, and takes long."""
+    Path(folder, "unfinished").write_text(str(os.getpid()))
+    Path(folder, "unfinished").rename(Path(folder, f"{item}.pid"))
+    time.sleep(600)

@@ -1,12 +1,15 @@
 """Work given to the machines of a cluster: what comes back, in which order, and every way it can end."""
 
+import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
+import psutil
 import pytest
 
 from stages.hardware import cluster
@@ -115,3 +118,29 @@ def test_a_cluster_that_is_gone_ends_the_wait(joined: str, monkeypatch: pytest.M
     with refused("hardware.cluster-lost", joined, cluster.RESUME_HINT):
         next(waits)
     ends.join()
+
+
+def test_an_interrupt_ends_the_work_on_all_machines(ray_cluster: str, tmp_path: Path) -> None:
+    code = (
+        "import sys, functools, pathlib\n"
+        "from stages.hardware import cluster\nfrom tests.stages.hardware import cluster_work\n"
+        "work = functools.partial(cluster_work.stay, pathlib.Path(sys.argv[2]))\n"
+        "with cluster.joined(sys.argv[1]): list(cluster.fan_out(work, [0]))"
+    )
+    interruptible = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(
+        [sys.executable, "-c", code, ray_cluster, str(tmp_path)], stderr=subprocess.PIPE, preexec_fn=interruptible
+    ) as child:
+        wait_for(lambda: (tmp_path / "0.pid").exists())
+        worker = psutil.Process(int((tmp_path / "0.pid").read_text()))
+        child.send_signal(signal.SIGINT)
+        _, said = child.communicate(timeout=120)
+    assert b"KeyboardInterrupt" in said
+    worker.wait(60)
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 300) -> None:
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.2)

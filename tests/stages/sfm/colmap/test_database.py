@@ -246,7 +246,7 @@ def test_a_cluster_extracts_the_same_features(
 ) -> None:
     photos, masks = pictures(tmp_path, 4, 0), tmp_path / "masks"
     masks.mkdir()
-    Image.fromarray(np.repeat(np.uint8([0, 255]), 240)[None].repeat(360, 0)).save(masks / "1.png.png")
+    Image.fromarray(np.repeat(np.array([0, 255], np.uint8), 240)[None].repeat(360, 0)).save(masks / "1.png.png")
     monkeypatch.setattr(database_module, "COUNTED_PHOTOS", 1)
 
     def extracted(name: str) -> list[bytes]:
