@@ -226,6 +226,11 @@ def fits_as_a_whole(matches: PairMatches, check: PoseCheck) -> bool:
     return exact_enough or not check.median_px > MAX_NOISE_MULTIPLE * matches.noise_px
 
 
+def median_error_px(matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"]) -> float:
+    """How far half of the matches lie from where the poses predict them."""
+    return _tolerance_px(pair_medians(matches, *transfer_errors_px(matches, world_from_camera)), matches.weight)[0]
+
+
 def agreement(
     matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"], among: Bool[np.ndarray, "pairs"]
 ) -> tuple[int, int]:

@@ -32,6 +32,7 @@ from stages.sfm.colmap.mapping import MAPPING_MODEL
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import camera_poses, check_model, facts
 from stages.sfm.imported.conventions import MIN_PAIRS, best_fit, fit_of_some
+from stages.sfm.imported.focal_lengths import fitting_focal_factor
 from stages.sfm.pairs.match_graph import MIN_INLIERS, natural_order, pairs_apart
 from stages.sfm.pairs.pair_selection import Pairs, closeness, nearest, union
 from stages.sfm.worker_process import environment
@@ -50,8 +51,8 @@ def check_imported_poses(
     poses stood as quaternions in a text file, which somebody may have written in another order.
 
     Returns what :func:`stages.sfm.colmap.repair.facts` says, with the ``fit`` of another convention where the poses
-    contradict their photos and it does not, or {"failed": why} where nothing could be compared. The
-    model stays as it is.
+    contradict their photos and it does not, and the ``focal_fit`` of other focal lengths; or {"failed": why} where
+    nothing could be compared. The model stays as it is.
     """
     job = {"photos": [asdict(photo) for photo in photos], "images": str(images.absolute()), "folder": str(folder)}
     job["of_quaternions"] = of_quaternions
@@ -103,7 +104,8 @@ def check(photos: list[dict[str, Any]], images: str, folder: str, of_quaternions
     fit = best_fit(checked.matches, poses, of_quaternions) if 2 * found["agreeing"] < found["pairs"] else None
     if fit is None and found["agreeing"] < found["pairs"]:
         fit = fit_of_some(checked.matches, poses, checked.check.agrees)
-    return found | {"fit": fit._asdict() if fit else None}
+    longer = None if fit or checked.fits else fitting_focal_factor(checked.matches, poses)
+    return found | {"fit": fit._asdict() if fit else None, "focal_fit": longer._asdict() if longer else None}
 
 
 def neighbours_by_pose(world_from_camera: Float[np.ndarray, "photos 3 4"]) -> Pairs:

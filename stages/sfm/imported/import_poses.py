@@ -10,6 +10,7 @@ from jaxtyping import Float
 from stages.contract import Progress, StageError, listed
 from stages.io.photos import Photo, read_frame_names
 from stages.io.sparse_model import SparseModel
+from stages.sfm.colmap.cameras import focal_lengths_and_centre
 from stages.sfm.colmap.models import read_model, write_model
 from stages.sfm.imported.check_worker import check_imported_poses
 from stages.sfm.imported.conventions import (
@@ -21,6 +22,7 @@ from stages.sfm.imported.conventions import (
     found_convention,
     named_axes,
 )
+from stages.sfm.imported.focal_lengths import FocalFit
 from stages.sfm.imported.pose_files import ImportedPoses, convention_of_format, read_poses
 
 MAX_NAMES = 5
@@ -39,6 +41,8 @@ def import_poses(
         read_as = convention.with_defaults(convention_of_format(cameras))
         names = _names(known.model, photos)
         raise _another_convention(cameras.name, check, Fit(**fit), read_as, names)
+    if check and (longer := check.pop("focal_fit")):
+        raise _other_focal_lengths(cameras.name, check["error_px"], FocalFit(**longer), known.model)
     if check:
         _note_doubts(cameras.name, check, known.model, photos, progress)
     judged = check.pop("images", {}) if check else {}
@@ -99,6 +103,19 @@ def _another_convention(
     )  # fmt: skip
 
 
+def _other_focal_lengths(name: str, error_px: float, fit: FocalFit, model: SparseModel) -> StageError:
+    """The error for cameras that fit their photos with other focal lengths."""
+    given = float(np.median([focal_lengths_and_centre(camera)[0] for camera in model.cameras]))
+    return StageError(
+        "sfm.other-focal-lengths",
+        f"the focal lengths of {name} do not fit the photos",
+        f"matches of the photos lie {error_px:.1f} px from where the cameras predict them, and {fit.error_px:.1f} px "
+        f"with focal lengths {fit.factor:.2f} times as long",
+        f"Correct them, {given:.0f} px to about {fit.factor * given:.0f} px, or the size that they are of; or leave "
+        "out the cameras to find them from the photos: pipeline run FOLDER",
+    )
+
+
 def _how_to_convert(fit: Fit, direction: str, axes: Float[np.ndarray, "3 3"], read_as: PoseConvention) -> str:
     """What to do with poses of this convention."""
     known = named_axes(axes)
@@ -153,4 +170,11 @@ def _note_doubts(
             "sfm.doubtful-poses",
             f"{len(check['doubtful'])} of {len(model.images)} imported poses contradict the matches of their photos: "
             f"{who}. They are used; correct or remove them in {source} if they are wrong",
+        )
+    elif not check["fits"]:
+        progress.note(
+            "sfm.cameras-inexact",
+            f"the cameras of {source} are inexact: matches of the photos lie {check['error_px']:.1f} px from where the "
+            f"cameras predict them, and {check['noise_px']:.1f} px from where two photos alone do. Check distortion "
+            "and principal point; or leave out the cameras to find them from the photos",
         )
