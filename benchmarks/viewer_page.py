@@ -4,12 +4,14 @@
     python -m benchmarks.viewer_page PHOTOS.nerf
     python -m benchmarks.viewer_page demo/demo.nerf --truth demo/truth.json
 
-A row per test photo: PSNR between the page's picture and the renderer's of the field as it was trained, at SIDE pixels,
-without distortion; how much better or worse the page's picture scores against its small photo than the renderer's. With
---truth (of `pipeline demo`'s photos) also lengths between points that are clicked: the median error of LENGTHS of them.
+A row per test photo: PSNR between the page's picture and the renderer's, at SIDE pixels, without distortion: of the
+field as it was trained, and in the bits that the page has; samples per pixel; how much better or worse the page's
+picture scores against its small photo than the renderer's. With --truth (of `pipeline demo`'s photos) also lengths
+between points that are clicked: the median error of LENGTHS of them.
 """
 
 import argparse
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ import torch
 from PIL import Image
 
 from benchmarks.record import Record, add_out
+from nerf.fields.hash_grid import HashGridField
 from nerf.geometry.alignment import align
 from nerf.geometry.rays import rays_of_view
 from nerf.geometry.scene import Scene, View
@@ -28,10 +31,26 @@ from pipeline.engine.workspace import Workspace
 from stages.effects.image_effects import photo_effects
 from stages.io.files import read_json, read_scene
 from stages.render.renderer import Renderer, load_renderer
+from stages.viewer.tables import quantised, with_table
 from tests.stages.viewer.browser import Viewer, chromium, pinhole_rays, psnr, request_of
 
 SIDE, VIEWS, LENGTHS = 320, 4, 40
 MIN_LENGTH = 0.2  # of a pair, in units of the truth, whose table is 2.4 across
+
+
+def packed(page: Viewer, renderer: Renderer) -> Renderer:
+    """The field in the page's bits."""
+    field = renderer.field
+    assert isinstance(field, HashGridField)
+    table = quantised(field.layout, field.table, page.run("viewer.contents.field.bits"))
+    return replace(renderer, model=with_table(field, table))
+
+
+def samples_per_pixel(page: Viewer, width: int, height: int, request: dict[str, Any]) -> float:
+    """Densities that the shader evaluates, of a picture at a quarter of the size."""
+    drawn = page.picture(width // 4, height // 4, request | {"view": "cost"})
+    low, high = (255 * drawn[..., :2]).round().transpose(2, 0, 1)
+    return float((low + 256 * high).mean())
 
 
 def pictures(page: Viewer, renderer: Renderer, info: dict[str, Any], scene: Scene, index: int) -> dict[str, float]:
@@ -47,13 +66,16 @@ def pictures(page: Viewer, renderer: Renderer, info: dict[str, Any], scene: Scen
     rays = pinhole_rays(view.scene_from_camera, small, (view.near, view.far)).each(
         lambda part: part.to(renderer.device)
     )
-    rendered = renderer.through(photo_effects(info, scene, view, renderer.device)).render(rays).colour
-    colour = rendered.clamp(0, 1).cpu().numpy()
+    effects = photo_effects(info, scene, view, renderer.device)
+    both = (renderer, packed(page, renderer))
+    colour, in_bits = (each.through(effects).render(rays).colour.clamp(0, 1).numpy() for each in both)
     photo = page.run(f"Array.from(viewer.contents.section('photo{index}'))")
     with Image.open(BytesIO(bytes(photo))) as opened:
         pixels = np.asarray(opened.resize((size[0], size[1]), Image.Resampling.BOX)) / 255
     return {
-        "page_against_renderer_db": round(psnr(drawn, colour), 1),
+        "agreement_db": round(psnr(drawn, colour), 1),
+        "agreement_in_bits_db": round(psnr(drawn, in_bits), 1),
+        "samples_per_pixel": round(samples_per_pixel(page, size[0], size[1], request), 1),
         "score_difference_db": round(psnr(drawn, pixels) - psnr(colour, pixels), 3),
     }
 
@@ -92,6 +114,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workspaces", nargs="+", type=Path)
     parser.add_argument("--truth", type=Path)
+    parser.add_argument("--photos", type=int, default=VIEWS, help="test photos of each workspace")
     add_out(parser)
     given = parser.parse_args()
     record = Record(given.out)
@@ -102,7 +125,7 @@ def main() -> None:
             train = workspace.folder("train", keys["train"])
             scene = read_scene(workspace.folder("normalise", keys["normalise"]))
             page = Viewer(browser, workspace.folder("viewer", keys["viewer"]) / "viewer.html", SIDE, SIDE)
-            tests = [index for index, view in enumerate(scene.views) if view.split == "test"][:VIEWS]
+            tests = [index for index, view in enumerate(scene.views) if view.split == "test"][: given.photos]
             for index in tests:
                 figures = pictures(page, load_renderer(train), read_json(train / "field.json"), scene, index)
                 if truth is not None:

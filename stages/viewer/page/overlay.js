@@ -38,7 +38,7 @@ class Overlay {
    *  are [from, to, colour]. The crop box applies to points and mesh: cameras mostly stand outside of it. */
   draw(request, target, { lines, above }, chosen) {
     const { gl } = this.graphics, shown = [...lines];
-    if (this.layers.cameras) shown.push(...this.cameraLines(chosen));
+    if (this.layers.cameras) shown.push(...this.cameraLines(chosen, request.pose.centre));
     if (this.layers.axes) AXES.forEach(([axis, colour]) => shown.push([[0, 0, 0], scaled(axis, 0.5), colour]));
     this.begin(request, target);
     if (this.layers.mesh) this.drawMesh(request.crop);
@@ -73,9 +73,10 @@ class Overlay {
     gl.uniform3fv(at("cropHigh"), crop.high);
   }
 
-  cameraLines(chosen) {
+  /** Not of the camera that the eye stands in: its edges would lie across the picture. */
+  cameraLines(chosen, eye) {
     return this.contents.views.flatMap((view, index) => {
-      if (index === chosen) return [];
+      if (index === chosen || norm(subtract(view.pose.centre, eye)) < 0.5 * this.frustumDepth) return [];
       const corners = this.frustum(view), colour = COLOURS[view.split];
       return corners.flatMap((corner, i) => [[corner, corners[(i + 1) % 4], colour], [view.pose.centre, corner, colour]]);
     });

@@ -437,6 +437,13 @@ def test_a_saved_picture_is_what_is_shown_with_its_layers(ball: Viewer, tmp_path
     assert 100 < red.sum() < 5000 and np.abs(pictures[1] - plain)[~red].max() <= 1
 
 
+def test_the_camera_one_stands_in_is_not_drawn(ball: Viewer):
+    lines = """(share) => { const { overlay, contents: { views } } = viewer, [view] = views;
+      const aside = add(view.pose.centre, scaled(right(view.pose), share * overlay.frustumDepth));
+      return overlay.cameraLines(null, aside).length - overlay.cameraLines(0, aside).length; }"""
+    assert ball.run(lines, 0.1) == 0 and ball.run(lines, 1.0) == 8
+
+
 def test_a_camera_behind_the_surface_is_not_clicked(ball: Viewer):
     """A camera that stands on the ray of a pixel, before the surface that this shows and behind it."""
     click = """(share) => {
