@@ -149,10 +149,9 @@ def share(value: Result) -> Callable[[], Result]:
     arrays in it, read-only, in common. Raises StageError where the cluster is gone."""
     if _joined is None:
         return lambda: value
-    try:
-        return partial(_fetch, _joined.ray.put(value))
-    except _joined.ray.exceptions.RayError as error:
-        raise _lost(_joined) from error
+    if not _answers(_joined.address, REACH_SECONDS):  # Ray would end this process without a word
+        raise _lost(_joined)
+    return partial(_fetch, _joined.ray.put(value))
 
 
 def _numbered(
@@ -282,8 +281,13 @@ def _join(address: str) -> Cluster:
 
 
 def _ray() -> Any:
-    # Before it is loaded; what goes wrong with a piece is raised where its result is wanted.
-    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_IGNORE_UNHANDLED_ERRORS": "1"}
+    # Before it is loaded. What goes wrong with a piece is raised where its result is wanted, and where the cluster goes
+    # while nothing is asked of it, Ray is not to end this process: the stage at work needs no cluster.
+    os.environ |= {
+        "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_IGNORE_UNHANDLED_ERRORS": "1",
+        "RAY_gcs_rpc_server_reconnect_timeout_s": str(10**6),
+    }
     try:
         import ray  # pyright: ignore[reportMissingImports] -- not part of what tests install
     except ImportError as error:

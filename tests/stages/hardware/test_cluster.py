@@ -120,6 +120,12 @@ def test_a_cluster_that_is_gone_ends_the_wait(joined: str, monkeypatch: pytest.M
     ends.join()
 
 
+def test_a_cluster_that_went_unnoticed_is_not_asked(joined: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "_answers", lambda *_: False)
+    with refused("hardware.cluster-lost", joined, cluster.RESUME_HINT):
+        list(cluster.fan_out(abs, [-1]))
+
+
 def test_an_interrupt_ends_the_work_on_all_machines(ray_cluster: str, tmp_path: Path) -> None:
     code = (
         "import sys, functools, pathlib\n"
