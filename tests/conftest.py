@@ -37,7 +37,7 @@ def shared_data() -> Path:
     return folder.resolve()
 
 
-class SilentProgress:
+class RecordedProgress:
     """A Progress that remembers what was said."""
 
     def __init__(self) -> None:
@@ -128,6 +128,6 @@ def use_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]
 
 
 @pytest.fixture
-def progress() -> SilentProgress:
+def progress() -> RecordedProgress:
     """A Progress for calling a stage's run() directly."""
-    return SilentProgress()
+    return RecordedProgress()

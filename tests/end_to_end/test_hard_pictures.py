@@ -13,7 +13,7 @@ from PIL import Image
 from stages.contract import StageError
 from stages.ingest.decoding import MAX_PIXELS, DecodeError, decode
 from stages.ingest.video_frames import take_frames
-from tests.conftest import SilentProgress
+from tests.conftest import RecordedProgress
 from tests.end_to_end.hard_scenes import RING, Picture, over_white, run, write_set
 from tests.fuzz.pictures import clip
 from tests.png_files import png
@@ -147,7 +147,7 @@ def test_a_video_with_a_false_size_is_refused_or_read(size: tuple[int, int], tmp
     (tmp_path / "a.mp4").write_bytes(content)
     (tmp_path / "out").mkdir()
     try:
-        frames = take_frames(tmp_path / "a.mp4", 5, tmp_path / "out", SilentProgress())
+        frames = take_frames(tmp_path / "a.mp4", 5, tmp_path / "out", RecordedProgress())
     except StageError as refusal:
         assert refusal.what.startswith(("cannot decode the video a.mp4", "cannot take photos from a.mp4"))
     else:

@@ -17,7 +17,7 @@ from stages import train
 from stages.contract import StageResult, plan_stage
 from stages.io.files import write_json
 from stages.train import training
-from tests.conftest import SilentProgress
+from tests.conftest import RecordedProgress
 from tests.stages.photo_scene import photographed
 from tests.stages.viewer.made_fields import NAMES
 
@@ -72,8 +72,8 @@ class RunningTraining:
 
     def _train(self) -> None:
         try:
-            config = plan_stage(train, self.config, self.inputs, SilentProgress())
-            loaded = training.load(config, self.inputs, self.partial, SilentProgress())
+            config = plan_stage(train, self.config, self.inputs, RecordedProgress())
+            loaded = training.load(config, self.inputs, self.partial, RecordedProgress())
             trainer, step = loaded.run.trainer, loaded.run.trainer.step
 
             def step_unless_over(number: int, progress: float, lr_scale: float) -> StepResult:
@@ -83,7 +83,7 @@ class RunningTraining:
 
             trainer.step = step_unless_over  # pyright: ignore[reportAttributeAccessIssue]
             training.compute(loaded)
-            result = training.save(loaded, self.partial, SilentProgress())
+            result = training.save(loaded, self.partial, RecordedProgress())
             self._finish("train", self.partial, result, "normalise")
         except BaseException as error:
             self.error = error

@@ -12,7 +12,7 @@ from stages import viewer
 from stages.contract import run_stage
 from stages.io.files import write_json
 from stages.train.live import LIVE, STATE
-from tests.conftest import SilentProgress
+from tests.conftest import RecordedProgress
 from tests.pipeline.view.running_training import KEYS, RunningTraining
 from tests.pipeline.view.test_server import Served
 from tests.stages.viewer.browser import Viewer, chromium
@@ -69,7 +69,7 @@ def test_a_finished_page_notices_another_training(browser: Any, tmp_path: Path) 
         train, out = training.workspace.folder("train", KEYS["train"]), tmp_path / "out"
         out.mkdir()
         config = viewer.Config(bits="8", mesh="off")
-        run_stage(viewer, config, training.inputs | {"train": train}, out, SilentProgress())
+        run_stage(viewer, config, training.inputs | {"train": train}, out, RecordedProgress())
         training.make_page((out / "viewer.html").read_text("utf-8"))
     server = Served(training)
     page = Viewer(browser, server.server.url)

@@ -16,7 +16,7 @@ from stages.contract import Inputs, Photos, StageResult, Workload, plan_stage
 from stages.depth import Config, estimation, files, matching
 from stages.depth.files import depth_map_file, read_depth_map
 from stages.hardware import cluster
-from tests.conftest import SilentProgress
+from tests.conftest import RecordedProgress
 from tests.refusals import refused
 from tests.stages.depth.walls import WallScene, cameras_before, wall
 
@@ -25,9 +25,9 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from stages import depth
-from tests.conftest import SilentProgress
+from tests.conftest import RecordedProgress
 inputs = {name: Path(sys.argv[1], name) for name in ("ingest", "normalise")}
-depth.run(depth.Config(downscale=1.5), inputs, Path(sys.argv[2]), SilentProgress())
+depth.run(depth.Config(downscale=1.5), inputs, Path(sys.argv[2]), RecordedProgress())
 """
 
 
@@ -43,10 +43,10 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
 
 
 def result_of(
-    inputs: Inputs, folder: Path, progress: SilentProgress | None = None
+    inputs: Inputs, folder: Path, progress: RecordedProgress | None = None
 ) -> tuple[StageResult, dict[str, bytes]]:
     folder.mkdir(exist_ok=True)
-    result = depth.run(Config(downscale=DOWNSCALE), inputs, folder, progress or SilentProgress())
+    result = depth.run(Config(downscale=DOWNSCALE), inputs, folder, progress or RecordedProgress())
     return result, content(folder)
 
 
@@ -82,7 +82,7 @@ def test_a_cluster_gives_the_same_bytes(inputs, undisturbed, tmp_path, ray_clust
         assert result_of(inputs, tmp_path)[1] == undisturbed[1]
 
 
-class Interrupted(SilentProgress):
+class Interrupted(RecordedProgress):
     """Ctrl-C once so many pairs are matched."""
 
     def __init__(self, pairs: int) -> None:
@@ -153,7 +153,7 @@ def test_a_pose_that_is_no_number_is_refused(inputs, tmp_path) -> None:
 
 def test_two_photos_cannot_agree(tmp_path) -> None:
     inputs = a_scene(cameras_before()[:2]).write(tmp_path)
-    progress = SilentProgress()
+    progress = RecordedProgress()
     with refused("depth.nothing-agrees"):
         result_of(inputs, tmp_path / "out", progress)
     assert progress.codes == ["depth.photos-alone"]
@@ -196,11 +196,11 @@ def test_large_pairs_are_matched_in_little_memory(inputs, undisturbed, tmp_path,
 def test_a_short_time_makes_smaller_maps(inputs, tmp_path) -> None:
     sides = []
     for seconds in (1e-3, 1e3):
-        planned = plan_stage(depth, Config(seconds=seconds), inputs, SilentProgress())
+        planned = plan_stage(depth, Config(seconds=seconds), inputs, RecordedProgress())
         assert planned.downscale is not None
         sides.append(240 / planned.downscale)
     assert sides == [pytest.approx(160, rel=0.01), 240]
-    assert plan_stage(depth, Config(), inputs, SilentProgress()).downscale == 1
+    assert plan_stage(depth, Config(), inputs, RecordedProgress()).downscale == 1
 
 
 def test_more_photos_and_neighbours_are_expected_to_take_longer() -> None:

@@ -8,7 +8,7 @@ import pytest
 from stages.depth import Config, run
 from stages.depth.consistency import DepthMap
 from stages.depth.files import depth_map_file, read_depth_map
-from tests.conftest import SilentProgress
+from tests.conftest import RecordedProgress
 from tests.stages.depth.walls import FISHEYE, Wall, WallScene, cameras_before, wall
 
 BOX = ((0.1, -0.3, 0), (0.35, 0.3), 10.0, "strong", 2)
@@ -22,7 +22,7 @@ def depth_maps(scene: WallScene, folder: Path, **options) -> list[DepthMap]:
     """What the stage makes of a scene, at the photos' own size."""
     inputs, out = scene.write(folder), folder / "depth"
     out.mkdir()
-    run(Config(downscale=1.0, **options), inputs, out, SilentProgress())
+    run(Config(downscale=1.0, **options), inputs, out, RecordedProgress())
     return [read_depth_map(depth_map_file(out, f"images/{index:03d}.png")) for index in range(len(scene.poses))]
 
 

@@ -26,7 +26,7 @@ from stages.effects.track_colours import (
 from stages.io.files import write_png
 from stages.io.photos import Photo, write_photos
 from stages.sfm.colmap.cameras import focal_and_centre
-from tests.conftest import SilentProgress
+from tests.conftest import RecordedProgress
 from tests.stages.photo_scene import pose_towards_origin
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 700.0
@@ -90,7 +90,7 @@ def without_points(points: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: array[:0] for name, array in points.items()}
 
 
-def test_colours_are_those_of_the_photos(tmp_path: Path, progress: SilentProgress) -> None:
+def test_colours_are_those_of_the_photos(tmp_path: Path, progress: RecordedProgress) -> None:
     scene, points = photographed_points(tmp_path)
     tracks = sample_photos(tmp_path, scene, points, progress).tracks
     assert len(tracks) > 60 and tracks.views == VIEWS - len(TEST_VIEWS)
@@ -100,7 +100,7 @@ def test_colours_are_those_of_the_photos(tmp_path: Path, progress: SilentProgres
     assert progress.updates[-1][1] == 1.0 and "6 of 6" in progress.updates[-1][0]
 
 
-def test_geometry_is_that_of_the_cameras(tmp_path: Path, progress: SilentProgress) -> None:
+def test_geometry_is_that_of_the_cameras(tmp_path: Path, progress: RecordedProgress) -> None:
     scene, points = photographed_points(tmp_path)
     tracks, xy = training_tracks(scene, points, MAX_OBSERVATIONS)
     view = scene.of_split("train")[tracks.view[7]]
@@ -113,7 +113,7 @@ def test_geometry_is_that_of_the_cameras(tmp_path: Path, progress: SilentProgres
     assert 0 < np.abs(residual).max() < 1e-3
 
 
-def test_test_photos_are_not_opened(tmp_path: Path, progress: SilentProgress) -> None:
+def test_test_photos_are_not_opened(tmp_path: Path, progress: RecordedProgress) -> None:
     scene, points = photographed_points(tmp_path)
     for number in TEST_VIEWS:
         (tmp_path / f"images/{number}.png").unlink()
@@ -122,7 +122,7 @@ def test_test_photos_are_not_opened(tmp_path: Path, progress: SilentProgress) ->
 
 @pytest.mark.parametrize("background", [True, False], ids=["alpha is the background", "alpha cuts out"])
 def test_masked_and_transparent_windows_are_left_out(
-    tmp_path: Path, progress: SilentProgress, background: bool
+    tmp_path: Path, progress: RecordedProgress, background: bool
 ) -> None:
     scene, points = photographed_points(tmp_path)
     whole = sample_photos(tmp_path, scene, points, progress).tracks
@@ -144,7 +144,7 @@ def test_masked_and_transparent_windows_are_left_out(
     assert len(cut) < len(whole)
 
 
-def test_clipped_windows_are_saturated(tmp_path: Path, progress: SilentProgress) -> None:
+def test_clipped_windows_are_saturated(tmp_path: Path, progress: RecordedProgress) -> None:
     gain = np.ones(VIEWS)
     gain[3] = 2.2
     scene, points = photographed_points(tmp_path, np.minimum(gain, 255 / 159))
@@ -153,7 +153,7 @@ def test_clipped_windows_are_saturated(tmp_path: Path, progress: SilentProgress)
     assert np.array_equal(tracks.saturated, bright)
 
 
-def test_a_dark_channel_leaves_the_others_their_gains(tmp_path: Path, progress: SilentProgress) -> None:
+def test_a_dark_channel_leaves_the_others_their_gains(tmp_path: Path, progress: RecordedProgress) -> None:
     """Photos by lamplight: their blue is cut off nearly everywhere."""
     scene, points = photographed_points(tmp_path, np.linspace(0.8, 1.4, VIEWS))
     by_day = fit_exposure(sample_photos(tmp_path, scene, points, progress).tracks)
@@ -192,7 +192,7 @@ def test_windows_are_summed_as_if_each_were_looked_at() -> None:
     assert 100 < len(there) < 450 and 0.01 < there[:, 3].mean() < 0.9
 
 
-def test_fewer_observations_are_whole_tracks(tmp_path: Path, progress: SilentProgress) -> None:
+def test_fewer_observations_are_whole_tracks(tmp_path: Path, progress: RecordedProgress) -> None:
     scene, points = photographed_points(tmp_path)
     all_of_them, some = training_tracks(scene, points, MAX_OBSERVATIONS)[0], training_tracks(scene, points, 60)[0]
     assert 30 < len(some) < 75 < len(all_of_them)
@@ -201,7 +201,7 @@ def test_fewer_observations_are_whole_tracks(tmp_path: Path, progress: SilentPro
     np.testing.assert_array_equal(kept[kept > 0], lengths[kept > 0])
 
 
-def test_near_photos_have_larger_windows(tmp_path: Path, progress: SilentProgress) -> None:
+def test_near_photos_have_larger_windows(tmp_path: Path, progress: RecordedProgress) -> None:
     scene, points = photographed_points(tmp_path)
     tracks = training_tracks(scene, points, MAX_OBSERVATIONS)[0]
     near = replace(tracks, footprint=np.where(tracks.view == 0, 0.5, 1.0) * 0.03)
@@ -210,7 +210,7 @@ def test_near_photos_have_larger_windows(tmp_path: Path, progress: SilentProgres
     assert set(window[(near.view == 0) & paired]) == {11} and set(window[near.view > 0]) == {5}
 
 
-def test_places_where_a_point_should_be_seen(tmp_path: Path, progress: SilentProgress) -> None:
+def test_places_where_a_point_should_be_seen(tmp_path: Path, progress: RecordedProgress) -> None:
     scene, points = photographed_points(tmp_path)
     point = int(np.bincount(points["point"][points["view"] == 2]).argmax())
     removed = (points["view"] == 2) & (points["point"] == point)
@@ -254,13 +254,13 @@ def test_only_photos_nearby_are_asked_what_should_be_seen(monkeypatch: pytest.Mo
     assert len({point for _, point in some}) > 0.5 * len({point for _, point in near})
 
 
-def test_without_points_only_the_photos_are_looked_at(tmp_path: Path, progress: SilentProgress) -> None:
+def test_without_points_only_the_photos_are_looked_at(tmp_path: Path, progress: RecordedProgress) -> None:
     scene, points = photographed_points(tmp_path)
     looked = sample_photos(tmp_path, scene, without_points(points), progress)
     assert len(looked.tracks) == len(looked.expected) == 0 and looked.tracks.views == 6
 
 
-def test_all_evidence_of_a_scene(tmp_path: Path, progress: SilentProgress) -> None:
+def test_all_evidence_of_a_scene(tmp_path: Path, progress: RecordedProgress) -> None:
     gain = np.where(np.arange(VIEWS) % 2, 1.0, 0.7)
     scene, points = photographed_points(tmp_path, gain)
     found = scene_statistics(tmp_path, scene, points, {"images/1.png": None, "images/2.png": 0.1}, progress)
@@ -280,7 +280,7 @@ def test_all_evidence_of_a_scene(tmp_path: Path, progress: SilentProgress) -> No
     assert set(found.seconds) == set(found.of) and min(found.seconds.values()) > 0
 
 
-def test_no_evidence_without_points(tmp_path: Path, progress: SilentProgress) -> None:
+def test_no_evidence_without_points(tmp_path: Path, progress: RecordedProgress) -> None:
     scene, points = photographed_points(tmp_path)
     found = scene_statistics(tmp_path, scene, without_points(points), {}, progress).of
     unsure = {name for name, evidence in found.items() if evidence.called_for is None}

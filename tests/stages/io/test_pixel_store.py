@@ -18,7 +18,7 @@ import stages.io.pixel_store
 from pipeline.engine.workspace import Workspace
 from stages.contract import StageError
 from stages.io.pixel_store import Load, PixelStore, StoredPhoto, checksum, pixel_store
-from tests.conftest import SilentProgress
+from tests.conftest import RecordedProgress
 
 SIZES = [(5, 3), (4, 2), (7, 6), (5, 3)]  # (width, height)
 
@@ -33,7 +33,7 @@ def store_of(folder: Path, channels: int = 3, name: str = "train") -> PixelStore
     return pixel_store(ingest, name, photos, channels)
 
 
-def fill(store: PixelStore, load: Load, progress: SilentProgress) -> None:
+def fill(store: PixelStore, load: Load, progress: RecordedProgress) -> None:
     """With two workers."""
     stages.io.pixel_store.fill(store, load, lambda: 2, progress)
 
@@ -55,7 +55,7 @@ def kept(store: PixelStore, index: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("channels", [3, 4])
-def test_it_holds_what_was_loaded(tmp_path: Path, progress: SilentProgress, channels: int) -> None:
+def test_it_holds_what_was_loaded(tmp_path: Path, progress: RecordedProgress, channels: int) -> None:
     store = store_of(tmp_path, channels)
     assert not store.is_whole
     fill(store, lambda index: painted(index, channels), progress)
@@ -70,7 +70,7 @@ def test_it_holds_what_was_loaded(tmp_path: Path, progress: SilentProgress, chan
     assert progress.notes == []
 
 
-def test_it_is_made_once_and_lies_beside_ingest(tmp_path: Path, progress: SilentProgress) -> None:
+def test_it_is_made_once_and_lies_beside_ingest(tmp_path: Path, progress: RecordedProgress) -> None:
     fill(store_of(tmp_path), painted, progress)
     again = store_of(tmp_path)
     fill(again, never, progress)
@@ -93,7 +93,7 @@ def test_another_content_is_another_store(tmp_path: Path) -> None:
     assert len({store.path for store in (first, *others)}) == 7
 
 
-def test_clean_takes_it_away(tmp_path: Path, progress: SilentProgress) -> None:
+def test_clean_takes_it_away(tmp_path: Path, progress: RecordedProgress) -> None:
     (tmp_path / "ingest").mkdir()
     store = store_of(tmp_path / "ingest")
     fill(store, painted, progress)
@@ -102,7 +102,7 @@ def test_clean_takes_it_away(tmp_path: Path, progress: SilentProgress) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 1, 10_000])
-def test_a_damaged_store_is_made_again_and_said(tmp_path: Path, progress: SilentProgress, size: int) -> None:
+def test_a_damaged_store_is_made_again_and_said(tmp_path: Path, progress: RecordedProgress, size: int) -> None:
     store = store_of(tmp_path)
     fill(store, painted, progress)
     os.truncate(store.path, size)
@@ -113,7 +113,7 @@ def test_a_damaged_store_is_made_again_and_said(tmp_path: Path, progress: Silent
     assert progress.names("io.pixel-store-rebuilt", store.path.name, f"{size:,} bytes", 256)
 
 
-def test_photos_are_decoded_a_few_at_a_time_and_dropped(tmp_path: Path, progress: SilentProgress) -> None:
+def test_photos_are_decoded_a_few_at_a_time_and_dropped(tmp_path: Path, progress: RecordedProgress) -> None:
     ingest = tmp_path / "ingest"
     ingest.mkdir()
     (ingest / "a").touch()
@@ -136,7 +136,7 @@ def test_photos_are_decoded_a_few_at_a_time_and_dropped(tmp_path: Path, progress
     assert kept(store, 39).min() == kept(store, 39).max() == 39
 
 
-def test_a_failure_leaves_nothing_behind(tmp_path: Path, progress: SilentProgress) -> None:
+def test_a_failure_leaves_nothing_behind(tmp_path: Path, progress: RecordedProgress) -> None:
     def fails(index: int) -> np.ndarray:
         if index == 2:
             raise OSError("truncated")
@@ -152,7 +152,7 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path, progress: SilentProgres
     assert store.is_whole
 
 
-def test_no_room_is_said_before_anything_is_decoded(tmp_path: Path, progress: SilentProgress) -> None:
+def test_no_room_is_said_before_anything_is_decoded(tmp_path: Path, progress: RecordedProgress) -> None:
     (tmp_path / "ingest").mkdir()
     (tmp_path / "ingest/a").touch()
     store = pixel_store(tmp_path / "ingest", "train", [StoredPhoto("a", 10**7, 10**7)], 3)
@@ -163,7 +163,7 @@ def test_no_room_is_said_before_anything_is_decoded(tmp_path: Path, progress: Si
     assert not store.path.exists()
 
 
-def test_more_than_memory_is_said(tmp_path: Path, progress: SilentProgress, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_than_memory_is_said(tmp_path: Path, progress: RecordedProgress, monkeypatch: pytest.MonkeyPatch) -> None:
     store = store_of(tmp_path)
     fill(store, painted, progress)
     monkeypatch.setattr("stages.io.pixel_store.FITS", 0.0)
@@ -172,7 +172,7 @@ def test_more_than_memory_is_said(tmp_path: Path, progress: SilentProgress, monk
     assert progress.names("io.photos-exceed-memory", "0 MB", "--train.downscale")
 
 
-def test_a_second_process_waits_and_finds_it_made(tmp_path: Path, progress: SilentProgress) -> None:
+def test_a_second_process_waits_and_finds_it_made(tmp_path: Path, progress: RecordedProgress) -> None:
     store = store_of(tmp_path)
     store.path.parent.mkdir()
     lock = FileLock(store.path.with_name(f"{store.path.name}.lock"))
@@ -192,7 +192,7 @@ def test_a_second_process_waits_and_finds_it_made(tmp_path: Path, progress: Sile
 KILLED = """
 import os, signal, sys, time
 from pathlib import Path
-from tests.conftest import SilentProgress
+from tests.conftest import RecordedProgress
 from tests.stages.io.test_pixel_store import fill, painted, store_of
 
 def load(index):
@@ -201,12 +201,12 @@ def load(index):
         os.kill(os.getpid(), signal.SIGKILL)
     return painted(index)
 
-fill(store_of(Path(sys.argv[1])), load, SilentProgress())
+fill(store_of(Path(sys.argv[1])), load, RecordedProgress())
 """
 
 
 @pytest.mark.skipif(os.name != "posix", reason="SIGKILL")
-def test_a_kill_leaves_no_store_and_no_lock(tmp_path: Path, progress: SilentProgress) -> None:
+def test_a_kill_leaves_no_store_and_no_lock(tmp_path: Path, progress: RecordedProgress) -> None:
     store = store_of(tmp_path)
     killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], cwd=Path(__file__).parents[3])
     assert killed.returncode == -signal.SIGKILL
@@ -216,7 +216,7 @@ def test_a_kill_leaves_no_store_and_no_lock(tmp_path: Path, progress: SilentProg
     assert not store.path.with_name(f"{store.path.name}.partial").exists()
 
 
-def test_a_flipped_bit_is_found_said_and_made_again(tmp_path: Path, progress: SilentProgress) -> None:
+def test_a_flipped_bit_is_found_said_and_made_again(tmp_path: Path, progress: RecordedProgress) -> None:
     store = store_of(tmp_path)
     fill(store, painted, progress)
     sound = store.path.read_bytes()

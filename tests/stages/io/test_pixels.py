@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 
 from stages.train.data import training_dataset
-from tests.conftest import SilentProgress
+from tests.conftest import RecordedProgress
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 
 
 @pytest.mark.parametrize("downscale", [1.0, 8.0])
 @pytest.mark.parametrize("has_alpha", [True, False])  # of the scene: where it has none, that of photos is dropped
 def test_parallel_decoding_follows_the_files_sizes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, progress: SilentProgress, has_alpha: bool, downscale: float
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, progress: RecordedProgress, has_alpha: bool, downscale: float
 ) -> None:
     def pool(workers: int) -> ThreadPoolExecutor:
         asked.append(workers)

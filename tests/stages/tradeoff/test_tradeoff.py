@@ -26,7 +26,7 @@ from stages.train.config import WHITE, FieldName
 from stages.train.data import PhotoReader, view_rays
 from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.fields.vanilla_options import VanillaOptions
-from tests.conftest import SilentProgress
+from tests.conftest import RecordedProgress
 from tests.refusals import refused
 from tests.stages.photo_scene import photographed
 
@@ -79,7 +79,7 @@ def studied(folder: Path, photos: dict[str, Path], progress: Any, **settings: An
 def whole(tmp_path_factory: pytest.TempPathFactory, photos: dict[str, Path]) -> tuple[Path, StageResult]:
     """A study that nobody disturbed, and its folder. Do not write into it."""
     folder = tmp_path_factory.mktemp("studied")
-    return folder, studied(folder, photos, SilentProgress())
+    return folder, studied(folder, photos, RecordedProgress())
 
 
 class Killed(BaseException):

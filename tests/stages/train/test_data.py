@@ -28,7 +28,7 @@ from stages.train.data import (
     view_mask,
     view_rays,
 )
-from tests.conftest import SilentProgress
+from tests.conftest import RecordedProgress
 from tests.refusals import refused
 from tests.stages.photo_scene import CAMERA, FOCAL, HEIGHT, RADIUS, WIDTH, ball_photo, photographed, seen_points
 
@@ -62,7 +62,7 @@ def test_a_views_rays_go_through_its_pixel_centres(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("downscale", [1.0, 2.0, 3.3])
 def test_the_ray_dataset_has_the_views_pixels_and_rays(
-    downscale: float, tmp_path: Path, progress: SilentProgress
+    downscale: float, tmp_path: Path, progress: RecordedProgress
 ) -> None:
     inputs, scene = photographed(tmp_path)
     dataset = training_dataset(inputs["ingest"], scene, "train", downscale, progress)
@@ -76,7 +76,7 @@ def test_the_ray_dataset_has_the_views_pixels_and_rays(
     torch.testing.assert_close(rays.directions, torch.cat(directions))
 
 
-def test_transparent_pixels_are_shown_over_the_background(tmp_path: Path, progress: SilentProgress) -> None:
+def test_transparent_pixels_are_shown_over_the_background(tmp_path: Path, progress: RecordedProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=4)
     reader = PhotoReader(inputs["ingest"], scene, 1.0)
     over_white = reader.pixels(scene.views[0], WHITE)
@@ -87,7 +87,7 @@ def test_transparent_pixels_are_shown_over_the_background(tmp_path: Path, progre
 
 
 @pytest.mark.parametrize("downscale", [1.0, 2.0])
-def test_ignored_alpha_is_like_a_mask(downscale: float, tmp_path: Path, progress: SilentProgress) -> None:
+def test_ignored_alpha_is_like_a_mask(downscale: float, tmp_path: Path, progress: RecordedProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=4)
     write_png(inputs["ingest"] / "opaque/all.png", ball_photo(4)[..., 3].copy())
     views = tuple(replace(view, mask="opaque/all.png") for view in scene.views)
@@ -102,7 +102,7 @@ def test_ignored_alpha_is_like_a_mask(downscale: float, tmp_path: Path, progress
     assert view_mask(inputs["ingest"], scene, scene.views[1], downscale) is None
 
 
-def test_an_opaque_photo_covers_every_pixel(tmp_path: Path, progress: SilentProgress) -> None:
+def test_an_opaque_photo_covers_every_pixel(tmp_path: Path, progress: RecordedProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=3)
     dataset = training_dataset(inputs["ingest"], replace(scene, has_alpha=True), "train", 1.0, progress)
     assert dataset.pixels.shape[1] == 4
@@ -110,7 +110,7 @@ def test_an_opaque_photo_covers_every_pixel(tmp_path: Path, progress: SilentProg
     assert torch.equal(dataset.pixels[: WIDTH * HEIGHT, :3], torch.from_numpy(ball_photo()).flatten(0, 1))
 
 
-def test_cameras_of_test_views_do_not_enter_the_training_dataset(tmp_path: Path, progress: SilentProgress) -> None:
+def test_cameras_of_test_views_do_not_enter_the_training_dataset(tmp_path: Path, progress: RecordedProgress) -> None:
     inputs, scene = photographed(tmp_path)
     other = replace(CAMERA, params=(FOCAL, FOCAL, 1.0, 1.0))
     views = tuple(replace(view, camera=int(view.split == "train")) for view in scene.views)
@@ -120,7 +120,7 @@ def test_cameras_of_test_views_do_not_enter_the_training_dataset(tmp_path: Path,
     assert torch.equal(dataset.patches, training_dataset(inputs["ingest"], scene, "train", 1.0, progress).patches)
 
 
-def test_evaluation_reads_the_pixels_that_training_stored(tmp_path: Path, progress: SilentProgress) -> None:
+def test_evaluation_reads_the_pixels_that_training_stored(tmp_path: Path, progress: RecordedProgress) -> None:
     inputs, scene = photographed(tmp_path)
     ingest, trained, held_out = inputs["ingest"], scene.of_split("train")[2], scene.of_split("test")[1]
     reader = PhotoReader(ingest, scene, 2.0)
@@ -181,7 +181,7 @@ def half_mask() -> np.ndarray:
 
 @pytest.mark.parametrize(("downscale", "columns"), [(1.0, 11), (2.0, 5), (3.0, 3)])
 def test_a_reduced_pixel_is_used_where_all_it_covers_is(
-    downscale: float, columns: int, tmp_path: Path, progress: SilentProgress
+    downscale: float, columns: int, tmp_path: Path, progress: RecordedProgress
 ) -> None:
     inputs, scene = photographed(tmp_path, mask=half_mask())
     used = view_mask(inputs["ingest"], scene, scene.views[0], downscale)
@@ -195,7 +195,7 @@ def test_a_reduced_pixel_is_used_where_all_it_covers_is(
 
 
 def test_masks_are_loaded_a_few_at_a_time_and_dropped(
-    tmp_path: Path, progress: SilentProgress, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, progress: RecordedProgress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """500 of 12 megapixels would be 6 GB."""
 
@@ -215,7 +215,7 @@ def test_masks_are_loaded_a_few_at_a_time_and_dropped(
 
 
 def test_no_photo_is_opened_where_the_pixels_are_there(
-    tmp_path: Path, progress: SilentProgress, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, progress: RecordedProgress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inputs, scene = photographed(tmp_path)
     pixels = training_dataset(inputs["ingest"], scene, "train", 1.0, progress).pixels
@@ -223,14 +223,14 @@ def test_no_photo_is_opened_where_the_pixels_are_there(
     assert torch.equal(training_dataset(inputs["ingest"], scene, "train", 1.0, progress).pixels, pixels)
 
 
-def test_without_masks_nothing_is_kept_of_them(tmp_path: Path, progress: SilentProgress) -> None:
+def test_without_masks_nothing_is_kept_of_them(tmp_path: Path, progress: RecordedProgress) -> None:
     inputs, scene = photographed(tmp_path)
     assert view_mask(inputs["ingest"], scene, scene.views[0], 1.0) is None
     assert training_dataset(inputs["ingest"], scene, "train", 1.0, progress).runs is None
     assert progress.notes == []
 
 
-def test_masks_that_leave_nothing_at_a_size_are_said(tmp_path: Path, progress: SilentProgress) -> None:
+def test_masks_that_leave_nothing_at_a_size_are_said(tmp_path: Path, progress: RecordedProgress) -> None:
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[4, 4] = 255
     inputs, scene = photographed(tmp_path, mask=mask)
@@ -241,7 +241,7 @@ def test_masks_that_leave_nothing_at_a_size_are_said(tmp_path: Path, progress: S
 
 @pytest.mark.parametrize("downscale", [1.0, 2.0, 3.3])
 def test_the_bank_knows_where_training_photos_show_points(
-    downscale: float, tmp_path: Path, progress: SilentProgress
+    downscale: float, tmp_path: Path, progress: RecordedProgress
 ) -> None:
     inputs, scene = photographed(tmp_path)
     dataset = guided_dataset(inputs, scene, downscale, progress)
@@ -258,7 +258,7 @@ def test_the_bank_knows_where_training_photos_show_points(
     assert float((hit.norm(dim=-1) - RADIUS).abs().mean()) < half_a_pixel / 2
 
 
-def test_depth_maps_are_those_of_the_training_photos(tmp_path: Path, progress: SilentProgress) -> None:
+def test_depth_maps_are_those_of_the_training_photos(tmp_path: Path, progress: RecordedProgress) -> None:
     inputs, scene = photographed(tmp_path)
     for number, view in enumerate(scene.views):
         if view.split == "train":
@@ -276,7 +276,7 @@ def test_depth_maps_are_those_of_the_training_photos(tmp_path: Path, progress: S
     assert guided_dataset(inputs, scene, 2.0, progress).depth_maps is None
 
 
-def test_points_guide_once_two_training_photos_saw_them(tmp_path: Path, progress: SilentProgress) -> None:
+def test_points_guide_once_two_training_photos_saw_them(tmp_path: Path, progress: RecordedProgress) -> None:
     inputs, scene = photographed(tmp_path)
     seen = seen_points(scene)
     trained = np.array([view.split == "train" for view in scene.views])[seen["view"]]
@@ -290,7 +290,7 @@ def test_points_guide_once_two_training_photos_saw_them(tmp_path: Path, progress
         assert (0 if dataset.sparse_pixels is None else len(dataset.sparse_pixels)) == known
 
 
-def test_points_on_the_rim_of_alpha_are_no_guide(tmp_path: Path, progress: SilentProgress) -> None:
+def test_points_on_the_rim_of_alpha_are_no_guide(tmp_path: Path, progress: RecordedProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=4)
     dataset, opaque = (guided_dataset(inputs, each, 1.0, progress) for each in (scene, replace(scene, has_alpha=False)))
     assert dataset.sparse_pixels is not None and opaque.sparse_pixels is not None
@@ -298,7 +298,7 @@ def test_points_on_the_rim_of_alpha_are_no_guide(tmp_path: Path, progress: Silen
     assert 0 < len(dataset.sparse_pixels) < len(opaque.sparse_pixels)
 
 
-def test_points_on_masked_pixels_are_no_guide(tmp_path: Path, progress: SilentProgress) -> None:
+def test_points_on_masked_pixels_are_no_guide(tmp_path: Path, progress: RecordedProgress) -> None:
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, WIDTH // 2 :] = 0
     inputs, scene = photographed(tmp_path, mask=mask)

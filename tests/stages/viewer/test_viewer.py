@@ -19,7 +19,7 @@ from stages.io.field_files import save_field
 from stages.viewer import contents
 from stages.viewer.contents import photo_side
 from stages.viewer.tables import quantised, sections, with_table
-from tests.conftest import SilentProgress
+from tests.conftest import RecordedProgress
 from tests.stages.viewer.made_fields import NAMES, Made, made, renamed
 
 LAYOUT = grid_layout(num_levels=3, base_res=4, max_res=16, log2_hashmap_size=9, features_per_level=4)
@@ -37,7 +37,7 @@ def table() -> torch.Tensor:
 def page_of(field: Made, folder: Path, **config: Any) -> tuple[str, dict[str, Any], dict[str, bytes]]:
     """The HTML, and what is packed in it: header and sections."""
     folder.mkdir()
-    run_stage(viewer, viewer.Config(**config), field.inputs, folder, SilentProgress())
+    run_stage(viewer, viewer.Config(**config), field.inputs, folder, RecordedProgress())
     text = (folder / "viewer.html").read_text("utf-8")
     packed = re.findall(r'type="application/octet-stream">([^<]*)<', text)
     whole = gzip.decompress(base64.b64decode(packed[0]))
@@ -141,7 +141,7 @@ def test_lengths_are_in_metres_where_the_scale_is_known(tmp_path: Path):
 
 
 def test_a_vanilla_nerf_has_a_page_that_says_why_not(tmp_path: Path):
-    field, progress = made(tmp_path, "box"), SilentProgress()
+    field, progress = made(tmp_path, "box"), RecordedProgress()
     model = VanillaNerf(VanillaSettings(depth=2, width=16), seed=0)
     save_field(field.inputs["train"], model, {"background": [1.0, 1.0, 1.0], "downscale": 1.0, "effects": {}})
     (tmp_path / "page").mkdir()
