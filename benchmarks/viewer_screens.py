@@ -14,19 +14,18 @@ import numpy as np
 
 from tests.stages.viewer.browser import Viewer, chromium
 
-SIZE, QUALITY = (720, 450), 85
+SIZE, QUALITY = (1000, 520), 85  # the menu leaves the scene its place
 REGION = 0.9  # half the side of the region of interest
 QUANTILES, MARGIN = (0.5, 99.5), 0.04  # percent of the points; scene units around them
 PATIENCE_SECONDS = 3600
 
 CROP = """(sides) => {
   byId("panel").hidden && byId("menu").click();
-  byId("crop").open = true;
   [...byId("crop-sliders").querySelectorAll("input")].forEach((input, i) => {
     input.value = sides[i];
     input.dispatchEvent(new Event("input"));
   });
-  byId("panel").scrollTop = byId("panel").scrollHeight;
+  byId("panel").scrollTop = 0;
 }"""
 
 

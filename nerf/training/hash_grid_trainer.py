@@ -22,7 +22,7 @@ from nerf.kernels import BOX
 from nerf.runtime.parallel import in_order
 from nerf.runtime.profiler import WorkCounts, span
 from nerf.runtime.randomness import generator
-from nerf.training.losses import huber_loss
+from nerf.training.colour_loss import huber_loss
 from nerf.training.metrics import psnr
 from nerf.training.pixel_sampler import PixelSampler
 from nerf.training.ray_dataset import RayDataset

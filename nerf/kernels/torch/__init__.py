@@ -12,13 +12,13 @@ from nerf.kernels.torch.compositing import (
     distortion_backward,
     visible_samples,
 )
+from nerf.kernels.torch.depth_loss import depth_loss, depth_loss_backward
 from nerf.kernels.torch.early_termination import finish_round, pack_rounds
 from nerf.kernels.torch.encoding import encode, encode_backward_points, encode_backward_table
 from nerf.kernels.torch.gather import gather_rows
 from nerf.kernels.torch.hidden_layer import add_ray_relu, add_ray_relu_backward, relu_backward
 from nerf.kernels.torch.marching import march, sample_points, sample_points_backward
 from nerf.kernels.torch.occupancy import cell_corners, occupancy_bits, scatter_max
-from nerf.kernels.torch.sparse_depth import depth_loss, depth_loss_backward
 from nerf.kernels.torch.spherical_harmonics import spherical_harmonics, spherical_harmonics_backward
 
 __all__ = [

@@ -14,6 +14,7 @@ from nerf.kernels.warp.compositing import (
     distortion_backward,
     visible_samples,
 )
+from nerf.kernels.warp.depth_loss import depth_loss, depth_loss_backward
 from nerf.kernels.warp.early_termination import finish_round, pack_rounds
 from nerf.kernels.warp.encoding import encode, encode_backward_points, encode_backward_table
 from nerf.kernels.warp.gather import gather_rows
@@ -21,7 +22,6 @@ from nerf.kernels.warp.hidden_layer import add_ray_relu, add_ray_relu_backward, 
 from nerf.kernels.warp.launch import compile_kernels, unavailable_reason
 from nerf.kernels.warp.marching import march, sample_points, sample_points_backward
 from nerf.kernels.warp.occupancy import cell_corners, occupancy_bits, scatter_max
-from nerf.kernels.warp.sparse_depth import depth_loss, depth_loss_backward
 from nerf.kernels.warp.spherical_harmonics import spherical_harmonics, spherical_harmonics_backward
 
 __all__ = [

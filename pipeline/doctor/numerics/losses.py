@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from nerf.kernels import Backend, RayStepping, Samples
-from nerf.training.losses import HUBER_DELTA, huber_loss
+from nerf.training.colour_loss import HUBER_DELTA, huber_loss
 from nerf.training.metrics import PSNR_LIMIT, psnr
 from pipeline.doctor.numerics import Bound, Case
 from pipeline.doctor.numerics.light import N, light, packed
@@ -109,7 +109,7 @@ CASES = [
     ),
     Case(
         formula="depth loss Σ w_i |m(t_i) − m(d)| + U |m(far) − m(d)|",
-        where="nerf/kernels/torch/sparse_depth.py: depth_loss, depth_loss_backward",
+        where="nerf/kernels/torch/depth_loss.py: depth_loss, depth_loss_backward",
         typical=_weights,
         extreme=_hard_weights,
         function=_depth_loss,
@@ -122,7 +122,7 @@ CASES = [
     ),
     Case(
         formula="colour loss e², 2 d |e| − d² where |e| > d",
-        where="nerf/training/losses.py: huber_loss",
+        where="nerf/training/colour_loss.py: huber_loss",
         typical=lambda: (decades(1, -6, 0, 256, 1),),
         extreme=lambda: (torch.tensor([[0.0], [0.1], [-0.1], [0.1000001], [-0.0999999], [1e30], [-1e30]]),),
         function=lambda _, error: huber_loss(error)[0],

@@ -13,8 +13,8 @@ from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import Rendering
 from nerf.kernels import torch as reference
+from nerf.training.colour_loss import huber_loss
 from nerf.training.hash_grid_trainer import HashGridTrainer, MicroBatch
-from nerf.training.losses import huber_loss
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite
 from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, same, small_dataset, trainer

@@ -21,7 +21,7 @@ MODULES = {
     "hidden_layer": 6,
     "marching": 4,
     "occupancy": 3,
-    "sparse_depth": 2,
+    "depth_loss": 2,
     "spherical_harmonics": 1,
 }
 

@@ -1,4 +1,4 @@
-"""The loss at sparse points (``nerf.kernels.torch.sparse_depth``): a ray is one thread's loop."""
+"""The loss at sparse points (``nerf.kernels.torch.depth_loss``): a ray is one thread's loop."""
 
 import torch
 import warp as wp
@@ -20,7 +20,7 @@ def depth_loss(
     distance: Float[Tensor, "rays"],
     stepping: RayStepping,
 ) -> Float[Tensor, "rays"]:
-    """As in nerf.kernels.torch.sparse_depth."""
+    """As in nerf.kernels.torch.depth_loss."""
     loss = torch.zeros_like(distance)
     packed = samples.starts, samples.t, weights
     launch(_depth_loss, len(distance), log_from(stepping), *packed, opacity, far, distance, loss)
@@ -34,7 +34,7 @@ def depth_loss_backward(
     stepping: RayStepping,
     grad: Float[Tensor, "rays"],
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "rays"]]:
-    """As in nerf.kernels.torch.sparse_depth."""
+    """As in nerf.kernels.torch.depth_loss."""
     grad_weights, grad_opacity = torch.zeros_like(samples.t), torch.zeros_like(distance)
     places = samples.starts, samples.t, far, distance
     launch(_depth_loss_backward, len(distance), log_from(stepping), *places, grad, grad_weights, grad_opacity)

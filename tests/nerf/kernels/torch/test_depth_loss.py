@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from nerf.kernels import RayStepping, Samples
-from nerf.kernels.torch.sparse_depth import depth_loss, depth_loss_backward
+from nerf.kernels.torch.depth_loss import depth_loss, depth_loss_backward
 
 EVEN, GROWING = (
     RayStepping(0.25, 0.0, False, 8, 100),

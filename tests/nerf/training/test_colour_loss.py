@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from nerf.training.losses import HUBER_DELTA, huber_loss
+from nerf.training.colour_loss import HUBER_DELTA, huber_loss
 
 
 def test_small_errors_are_squared_and_large_ones_pull_no_harder() -> None:
