@@ -30,7 +30,7 @@ from stages.sfm.colmap.database import (
     match_pairs,
     read_vocabulary,
 )
-from stages.sfm.colmap.mapping import MAPPING_MODEL
+from stages.sfm.colmap.mappers import MAPPING_MODEL
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import Checked, camera_poses, check_model
 from stages.sfm.pairs.image_retrieval import CELLS

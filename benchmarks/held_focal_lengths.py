@@ -22,7 +22,7 @@ import pycolmap
 from benchmarks.record import Record, add_out
 from stages.sfm.colmap.database import verify_again
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
-from stages.sfm.colmap.mapping import incremental_options, map_incrementally
+from stages.sfm.colmap.mappers import incremental_options, map_incrementally
 from stages.sfm.colmap.repair import check_model
 from stages.sfm.colmap.thinning import set_focal_length, thin_matches
 from stages.sfm.retry_strategies import STRATEGIES

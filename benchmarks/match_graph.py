@@ -30,7 +30,7 @@ from stages.sfm.colmap.database import (
     read_vocabulary,
     verified_matches,
 )
-from stages.sfm.colmap.mapping import MAPPING_MODEL
+from stages.sfm.colmap.mappers import MAPPING_MODEL
 from stages.sfm.pairs.feature_matching import match_descriptors
 from stages.sfm.pairs.image_retrieval import CELLS
 from stages.sfm.pairs.match_graph import (

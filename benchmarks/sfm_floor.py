@@ -39,7 +39,7 @@ from stages.sfm.colmap.database import (
     match_pairs,
     read_descriptors,
 )
-from stages.sfm.colmap.mapping import MAPPING_MODEL
+from stages.sfm.colmap.mappers import MAPPING_MODEL
 from stages.sfm.pairs.feature_matching import match_descriptors
 from stages.sfm.pairs.pair_selection import exhaustive
 from stages.sfm.pairs.quality_level import QUALITY_LEVELS

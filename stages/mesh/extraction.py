@@ -18,13 +18,14 @@ from stages.hardware.memory import available_bytes, check_memory
 from stages.io.field_files import load_field
 from stages.io.files import read_scene, read_tensors, write_png, write_tensors
 from stages.mesh.cleaning import Cleaned, boundary, clean
+from stages.mesh.decimation import decimate
 from stages.mesh.files import WRITERS, Z_UP_TO_Y_UP, ColouredMesh
 from stages.mesh.holes import Closed, close_holes
 from stages.mesh.iso_level import RETRAIN, IsoLevel, check_range, choose_iso_level
 from stages.mesh.marching_cubes import extract_surface
 from stages.mesh.preview import SMALL_COPY, preview, small_copy
 from stages.mesh.resolution import CHUNK, grid_box, point_cost, points_per_edge, slab_factor
-from stages.mesh.surface import Surface, decimate, face_areas, is_watertight, keep_faces, vertex_normals
+from stages.mesh.surface import Surface, face_areas, is_watertight, keep_faces, vertex_normals
 from stages.mesh.texture.texturing import Textured, texture_of
 from stages.mesh.visibility import ShadowMap, sample_rays, shadow_maps, vertex_visibility
 from stages.scale import metres_per_unit

@@ -5,9 +5,10 @@ from scipy.spatial import KDTree
 
 from nerf.geometry.camera_paths import levelled
 from nerf.geometry.scene import Scene
+from stages.mesh.decimation import decimate
 from stages.mesh.files import ColouredMesh
 from stages.mesh.rasteriser import Viewpoint, frame_mesh, rasterise, shade
-from stages.mesh.surface import Surface, decimate
+from stages.mesh.surface import Surface
 
 WIDTH, HEIGHT = 480, 400
 UP = np.array([0.0, 0.0, 1.0])

@@ -1,4 +1,4 @@
-"""Triangles: areas, normals, components, decimation, open borders, samples.
+"""Triangles: areas, normals, components, open borders, samples.
 
 ``vertices`` are (n, 3) float64, ``faces`` (m, 3) int32 indices, counter-clockwise seen from outside, that is from
 the side of lower density.
@@ -7,7 +7,6 @@ the side of lower density.
 from typing import NamedTuple
 
 import numpy as np
-from fast_simplification import simplify
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -60,26 +59,6 @@ def keep_faces(surface: Surface, keep: np.ndarray) -> tuple[Surface, np.ndarray]
     new = np.zeros(len(surface.vertices), np.int32)
     new[used] = np.arange(len(used))
     return Surface(surface.vertices[used], new[faces]), used
-
-
-def decimate(surface: Surface, max_faces: int) -> Surface:
-    """Collapse edges until ``max_faces`` remain (quadrics, Garland and Heckbert 1997); open borders stay put, and faces
-    folded onto each other are removed."""
-    if len(surface.faces) <= max_faces:
-        return surface
-    vertices, faces, *_ = simplify(surface.vertices, surface.faces, target_count=max_faces, preserve_border=True)
-    return keep_faces(Surface(vertices.astype(np.float64), faces.astype(np.int32)), ~_folded_pairs(faces))[0]
-
-
-def _folded_pairs(faces: np.ndarray) -> np.ndarray:
-    """Faces that lie back to back with a copy of themselves, or have a vertex twice, (m,) bool.
-
-    Removing them opens nothing. Other faces without area are kept: they join their neighbours.
-    """
-    a, b, c = faces.astype(np.int64).T
-    winding = np.sign(b - a) * np.sign(c - b) * np.sign(c - a)
-    which = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
-    return (np.bincount(which, winding) == 0)[which]
 
 
 def is_watertight(surface: Surface) -> bool:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from stages.io.files import make_durable
-from stages.sfm.colmap.mapping import map_globally
+from stages.sfm.colmap.mappers import map_globally
 from stages.sfm.colmap.models import write_native
 from stages.sfm.colmap.thinning import thin_matches
 from stages.sfm.job import end_with_parent

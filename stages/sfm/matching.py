@@ -24,7 +24,7 @@ from stages.sfm.colmap.database import (
     matched_pairs,
     verified_matches,
 )
-from stages.sfm.colmap.mapping import MAPPING_MODEL
+from stages.sfm.colmap.mappers import MAPPING_MODEL
 from stages.sfm.job import JobState
 from stages.sfm.pairs.match_graph import (
     MAX_GROWTH_ROUNDS,

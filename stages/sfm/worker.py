@@ -17,12 +17,12 @@ from stages.contract import Note, StageError
 from stages.hardware import cluster
 from stages.io.amounts import rough_duration
 from stages.io.files import make_durable
+from stages.sfm.checked_mapping import run_mapping
 from stages.sfm.colmap.diagnosis import find_conflict, links, supports
 from stages.sfm.colmap.final_bundle_adjustment import final_bundle_adjustment
 from stages.sfm.colmap.models import load_native, write_native
 from stages.sfm.colmap.repair import check_model, deregister, facts, reasons
 from stages.sfm.job import Job, JobState, Send, end_with_parent
-from stages.sfm.mapping import run_mapping
 from stages.sfm.matching import capture_sequence, match_photos
 from stages.sfm.retry_strategies import (
     MIN_LONG_FOCAL,

@@ -20,7 +20,7 @@ from stages.hardware import cluster
 from stages.hardware.device import processors
 from stages.hardware.memory import at_once
 from stages.io.photos import Photo, spread
-from stages.sfm.colmap.mapping import MAPPING_MODEL
+from stages.sfm.colmap.mappers import MAPPING_MODEL
 from stages.sfm.pairs.feature_matching import IndexedFeatures, index_features, match_descriptors, match_indexed
 from stages.sfm.pairs.image_retrieval import WORDS, Words, photo_similarity, vocabulary
 from stages.sfm.pairs.pair_selection import Pairs, SimilarityMatrix

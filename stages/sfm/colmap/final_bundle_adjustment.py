@@ -11,7 +11,7 @@ import pycolmap
 from stages.contract import Note
 from stages.sfm.colmap.camera_model_selection import CameraModels, adjustment_options, choose
 from stages.sfm.colmap.camera_models import MODELS, degenerate_cameras, set_camera_models
-from stages.sfm.colmap.mapping import pipeline_options
+from stages.sfm.colmap.mappers import pipeline_options
 from stages.sfm.colmap.observations import noise_px, observations
 from stages.sfm.colmap.uncertainty import pose_uncertainty_px
 

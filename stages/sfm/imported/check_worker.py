@@ -28,7 +28,7 @@ from stages.sfm.colmap.database import (
     match_pairs,
     verified_matches,
 )
-from stages.sfm.colmap.mapping import MAPPING_MODEL
+from stages.sfm.colmap.mappers import MAPPING_MODEL
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import camera_poses, check_model, facts
 from stages.sfm.imported.conventions import MIN_PAIRS, best_fit, fit_of_some

@@ -21,6 +21,7 @@ AXES: dict[str, Float[np.ndarray, "3 3"]] = {"opencv": np.eye(3), "opengl": OPEN
 # Of OpenCV's x, y and z, and their opposites.
 _WAYS = (("right", "left"), ("down", "up"), ("forward", "back"))
 MIN_PAIRS = 3  # verified pairs, for there to be any evidence
+SAME_POSE_WITHIN = 1e-6  # relatively: what floats of 32 bits make of two copies
 MIN_FIT = 0.8  # of the verified pairs agree, where a convention fits
 
 

@@ -23,7 +23,8 @@ from stages.sfm.imported.conventions import (
     named_axes,
 )
 from stages.sfm.imported.focal_lengths import FocalFit
-from stages.sfm.imported.pose_files import ImportedPoses, convention_of_format, read_poses
+from stages.sfm.imported.imported_poses import ImportedPoses
+from stages.sfm.imported.pose_files import convention_of_format, read_poses
 
 MAX_NAMES = 5
 

@@ -5,6 +5,7 @@ axes (down, right, backward), the place, and height, width and focal length in p
 https://github.com/Fyusion/LLFF#using-your-own-poses-without-running-colmap
 """
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,6 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf.geometry.scene import Camera
+from stages.io.photos import Photo
+from stages.io.sparse_model import SparseModel
+from stages.sfm.imported.conventions import PoseConvention, world_from_camera
+from stages.sfm.imported.imported_poses import ImportedPoses, notes_on_photos
+from stages.sfm.imported.orientation import fits_only_upright
+from stages.sfm.imported.posed_photos import distinct, posed_photo, unusable, without_rays
+from stages.sfm.imported.rotations import rigid
 
 ROW = 17
 # From LLFF's camera axes, down, right and backward, to OpenCV's, right, down and forward.
@@ -24,6 +32,31 @@ class LlffCamera(NamedTuple):
 
     camera: Camera
     world_from_camera: Float[np.ndarray, "3 4"]
+
+
+def read_llff_poses(
+    file: Path, photos: Sequence[Photo], rows: Mapping[str, str], convention: PoseConvention
+) -> ImportedPoses:
+    """Poses of a file; ``rows`` maps the place of a row, from 0, to a photo's name. Raises StageError."""
+    try:
+        given = read_llff(file)
+    except (OSError, ValueError) as error:
+        raise unusable("sfm.llff-unreadable", file.name, str(error)) from error
+    if len(given) != len(rows):
+        why = f"it has {len(given)} rows for {len(rows)} photos; it needs one row for each photo"
+        raise unusable("sfm.llff-count", file.name, why)
+    by_name = {photo.name: photo for photo in photos}
+    of = [(by_name[name], given[int(row)]) for row, name in rows.items() if name in by_name]
+    upright = any(fits_only_upright(one.camera, photo) for photo, one in of)
+    posed = []
+    for photo, one in sorted(of, key=lambda pair: pair[0].image_name):
+        where = f"the row of {file.name} for {photo.name!r}"
+        matrix, _ = rigid(one.world_from_camera, where)
+        pose = world_from_camera(matrix, convention)
+        posed.append(posed_photo(photo, photo.name, where, one.camera, pose, upright))
+    left_out = without_rays(posed)
+    model = SparseModel.without_points(*distinct([one for one in posed if one.file not in left_out]))
+    return ImportedPoses(model, left_out, None, notes_on_photos((), (), posed, left_out))
 
 
 def read_llff(file: Path) -> list[LlffCamera]:

@@ -28,7 +28,7 @@ from stages.sfm.colmap.database import (
     match_pairs,
     read_vocabulary,
 )
-from stages.sfm.colmap.mapping import MAPPING_MODEL
+from stages.sfm.colmap.mappers import MAPPING_MODEL
 from stages.sfm.pairs import Matcher
 from stages.sfm.pairs.image_retrieval import CELLS
 from stages.sfm.pairs.pair_selection import CapturePriors, capture_priors, choose, exhaustive, expected_pairs

@@ -104,6 +104,7 @@ class Viewer {
     const view = this.contents.views[index];
     this.lens = view.lens;
     [this.photo, this.nextPhoto] = [null, index];
+    this.changed(); // named at once, not by the first picture of the flight
     await this.navigation.flyTo(view.pose);
     if (this.nextPhoto !== index) return; // it was left on the way
     [this.photo, this.nextPhoto] = [index, null];

@@ -9,7 +9,8 @@ import pytest
 
 from stages.io.photos import Photo
 from stages.io.transforms_files import read_transforms
-from stages.sfm.imported.pose_files import ImportedPoses, read_poses
+from stages.sfm.imported.imported_poses import ImportedPoses
+from stages.sfm.imported.pose_files import read_poses
 from tests.refusals import codes, refused
 
 LENS = {"camera_angle_x": 0.7}

@@ -8,12 +8,12 @@ import torch
 from skimage.measure import marching_cubes
 
 from nerf.fields.density_grid import DensityGrid, occupancy
+from stages.mesh.decimation import decimate
 from stages.mesh.marching_cubes import extract_surface
 from stages.mesh.surface import (
     Surface,
     border_vertices,
     components,
-    decimate,
     face_areas,
     is_watertight,
     keep_faces,

@@ -14,10 +14,11 @@ import pytest
 
 from stages.io.photos import Photo
 from stages.sfm import global_mapping
+from stages.sfm.checked_mapping import Runs, _most_steps, _with_pieces_joined
 from stages.sfm.colmap.database import adopt_cameras, copy_without_pairs
 from stages.sfm.colmap.diagnosis import compare_models
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
-from stages.sfm.colmap.mapping import incremental_options, map_incrementally
+from stages.sfm.colmap.mappers import incremental_options, map_incrementally
 from stages.sfm.colmap.repair import (
     agreeing_pairs,
     better,
@@ -33,7 +34,6 @@ from stages.sfm.colmap.repair import (
     supported_steps,
 )
 from stages.sfm.colmap.thinning import thin_matches
-from stages.sfm.mapping import Runs, _most_steps, _with_pieces_joined
 from stages.sfm.matching import consecutive_pairs
 from stages.sfm.retry_strategies import MappingOptions
 

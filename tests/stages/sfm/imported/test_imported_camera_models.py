@@ -12,7 +12,8 @@ from stages.io.photos import Photo
 from stages.io.sparse_model import SparseImage, SparseModel
 from stages.sfm.colmap.cameras import camera_rays
 from stages.sfm.colmap.models import write_model
-from stages.sfm.imported.pose_files import ImportedPoses, read_poses
+from stages.sfm.imported.imported_poses import ImportedPoses
+from stages.sfm.imported.pose_files import read_poses
 from tests.camera_layouts import ring
 from tests.refusals import refused
 

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from stages.sfm.imported.pose_files import ImportedPoses, read_poses
+from stages.sfm.imported.imported_poses import ImportedPoses
+from stages.sfm.imported.pose_files import read_poses
 from tests.refusals import codes, refused
 from tests.stages.sfm.imported.test_pose_files import LENS, NAMES, PHOTOS, frame
 

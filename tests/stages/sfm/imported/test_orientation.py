@@ -20,8 +20,9 @@ from stages.io.pixels import load_pixels
 from stages.io.sparse_model import SparseImage, SparseModel
 from stages.sfm.colmap.cameras import camera_rays, project
 from stages.sfm.colmap.models import read_model, write_model
+from stages.sfm.imported.imported_poses import ImportedPoses
 from stages.sfm.imported.orientation import QUARTER_TURNS, pixel_map, same_shape, turned_camera, turned_pose
-from stages.sfm.imported.pose_files import ImportedPoses, read_poses
+from stages.sfm.imported.pose_files import read_poses
 from tests.camera_layouts import ring
 from tests.refusals import codes, refused
 from tests.stages.ingest.photo_files import exif_with

@@ -16,8 +16,9 @@ from stages.io.sparse_model import SparseImage, SparseModel
 from stages.io.transforms_export import intrinsics
 from stages.sfm.colmap.models import write_model
 from stages.sfm.imported.conventions import PoseConvention
+from stages.sfm.imported.imported_poses import ImportedPoses
 from stages.sfm.imported.photo_names import photos_by_name
-from stages.sfm.imported.pose_files import ImportedPoses, read_poses
+from stages.sfm.imported.pose_files import read_poses
 from tests.refusals import codes, refused
 
 W, H = 60, 40

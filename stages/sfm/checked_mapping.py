@@ -12,7 +12,7 @@ from stages.sfm.colmap.database import adopt_cameras
 from stages.sfm.colmap.diagnosis import compare_models, disagree
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.joining import Piece, join_pieces
-from stages.sfm.colmap.mapping import incremental_options, map_globally, map_incrementally
+from stages.sfm.colmap.mappers import incremental_options, map_globally, map_incrementally
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import (
     Candidate,

@@ -1,0 +1,26 @@
+"""Fewer triangles for the same surface."""
+
+import numpy as np
+from fast_simplification import simplify
+
+from stages.mesh.surface import Surface, keep_faces
+
+
+def decimate(surface: Surface, max_faces: int) -> Surface:
+    """Collapse edges until ``max_faces`` remain (quadrics, Garland and Heckbert 1997); open borders stay put, and faces
+    folded onto each other are removed."""
+    if len(surface.faces) <= max_faces:
+        return surface
+    vertices, faces, *_ = simplify(surface.vertices, surface.faces, target_count=max_faces, preserve_border=True)
+    return keep_faces(Surface(vertices.astype(np.float64), faces.astype(np.int32)), ~_folded_pairs(faces))[0]
+
+
+def _folded_pairs(faces: np.ndarray) -> np.ndarray:
+    """Faces that lie back to back with a copy of themselves, or have a vertex twice, (m,) bool.
+
+    Removing them opens nothing. Other faces without area are kept: they join their neighbours.
+    """
+    a, b, c = faces.astype(np.int64).T
+    winding = np.sign(b - a) * np.sign(c - b) * np.sign(c - a)
+    which = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+    return (np.bincount(which, winding) == 0)[which]
