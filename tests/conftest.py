@@ -1,6 +1,7 @@
 """Shared by all tests: shape checking of nerf/, and where the real photo sets are."""
 
 import functools
+import gc
 import pkgutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,6 +25,12 @@ torch.set_num_threads(1)
 # A slow machine is no failure.
 settings.register_profile("default", deadline=None)
 settings.load_profile("default")
+
+
+def pytest_collection_finish() -> None:
+    """What is imported by now lives as long as the process: no collection of garbage has to look through it again."""
+    gc.freeze()
+
 
 pytest_plugins = ["tests.ray_cluster", "tests.synthetic_photos"]
 

@@ -21,7 +21,7 @@ from stages.io.amounts import duration
 from stages.io.files import read_json, read_scene
 
 INPUTS = ("ingest", "sfm", "normalise")
-VERSION = 16
+VERSION = 17
 EXIT_CODE = 13
 RESUMES = False
 PUBLISHED = ("effects.json",)
@@ -73,8 +73,8 @@ class Config(StageConfig):
 
 
 def expected_seconds(config: Config, workload: Workload) -> float:
-    """Reading the photos, two or three seconds, and half a minute where a pilot has to decide."""
-    return 10.0 + workload.photos.reading_seconds(workload.cores)
+    """Reading the photos, two or three seconds, and a quarter of a minute for each pilot, of which most sets have one."""
+    return 20.0 + workload.photos.reading_seconds(workload.cores)
 
 
 def budget_seconds(left: BudgetLeft) -> float:

@@ -3,6 +3,10 @@
 Both arms have the same seed, rays and number of steps and differ in nothing but the effect. The photos kept back have
 an exposure (and, where an arm refines poses, a pose) of their own, which neither arm knows: so they are scored by the
 half-image protocol, fitted on the left half and scored on the right one.
+
+A pilot ends with the first seed that speaks against a change. For the mean of three seeds to be more than its noise,
+4.3 standard deviations / √3, none of them may gain much less than the others: where one gains less than MIN_GAIN_DB,
+what the others could still prove is a gain below 0.2 dB.
 """
 
 import time
@@ -34,11 +38,12 @@ from stages.train.planning import seconds_per_step
 from stages.train.validation_images import split_off_validation
 
 LONG_SIDE = 200  # pixels of the photos in a pilot
+DRAWN_SIDE = 100  # of a photo kept back: drawing all of its pixels takes as long as training, and says the same
 MAX_KEPT = 4  # of the training photos, to judge by; with fewer than MIN_FOR_INTERVAL their own noise is not known
-SEEDS = 3
+SEEDS = 3  # at most
 TARGET_SAMPLES = 1 << 13  # half the usual: a pilot has to be short, and is judged early
 MICRO_BATCHES = 4  # fixed, so that a pilot ends the same whatever the machine
-BESIDE_TRAINING = 0.3  # of the time of the trainings: reading photos, the warm-up, scoring
+BESIDE_TRAINING = 0.4  # of the time of the trainings: reading photos, the warm-up, scoring
 # Of a pilot's training, on one core, that take as long as fitting the pose of a photo kept back and drawing it again:
 # 7 in the scenes of tests/effect_scenes.py where alpha ends space, 20 to 26 where nothing does.
 STEPS_PER_FIT = 25
@@ -113,10 +118,18 @@ def pilot_scene(inputs: Inputs, scene: Scene, progress: Progress) -> PilotScene 
         )
         for view in split.of_split("validation")
     ]
-    kept = tuple(photo for photo in photos if enough(photo.colours, photo.used))
+    kept = tuple(photo for photo in map(_thinned, photos) if enough(photo.colours, photo.used))
     if len(kept) < MIN_FOR_INTERVAL:
         return f"too few training photos show enough at {size}"
     return PilotScene(split, dataset, kept)
+
+
+def _thinned(photo: _Photo) -> _Photo:
+    """Rows and columns of a photo, evenly spread, so that its longer side has about DRAWN_SIDE pixels."""
+    stride = max(1, round(max(photo.colours.shape[:2]) / DRAWN_SIDE))
+    rays = photo.rays.each(lambda part: part[::stride, ::stride])
+    used = None if photo.used is None else photo.used[::stride, ::stride]
+    return photo._replace(rays=rays, colours=photo.colours[::stride, ::stride], used=used)
 
 
 def fits_poses(off: Decisions, on: Decisions) -> bool:
@@ -126,8 +139,8 @@ def fits_poses(off: Decisions, on: Decisions) -> bool:
 
 
 def expected_seconds(scene: Scene, steps: int) -> tuple[float, float]:
-    """What a pilot takes here: its trainings, by a few steps of a fresh field, and what goes on beside them; and what a
-    pilot takes that fits poses, too."""
+    """What a pilot of all seeds takes here: its trainings, by a few steps of a fresh field, and what goes on beside them;
+    and what such a pilot takes that fits poses, too."""
     arm, device = Decisions({"view_dependence": {}} | ({} if scene.has_alpha else {"background": {}})), compute_device()
     per_step = seconds_per_step(_config(arm, scene, steps, device), scene, arm, device)
     trainings = (1 + BESIDE_TRAINING) * 2 * SEEDS * steps * per_step
@@ -135,8 +148,17 @@ def expected_seconds(scene: Scene, steps: int) -> tuple[float, float]:
     return trainings, trainings + 2 * SEEDS * MAX_KEPT * STEPS_PER_FIT * on_cpu * min(MICRO_BATCHES, cores())
 
 
-def run_pilot(trial: PilotScene, off: Decisions, on: Decisions, steps: int, seed: int, progress: Progress) -> Pilot:
-    """Train both arms for each seed and compare. Raises NonFinite where an arm diverges."""
+def run_pilot(
+    trial: PilotScene,
+    off: Decisions,
+    on: Decisions,
+    steps: int,
+    seed: int,
+    progress: Progress,
+    default: bool | None = None,
+) -> Pilot:
+    """Train both arms for each seed and compare; no more seeds once an effect clearly stays as it is by ``default``, on
+    or off. Raises NonFinite where an arm diverges."""
     gains: list[list[float]] = []
     arms, seconds = {"off": off, "on": on}, {"off": 0.0, "on": 0.0}
     poses = fits_poses(off, on)
@@ -151,6 +173,8 @@ def run_pilot(trial: PilotScene, off: Decisions, on: Decisions, steps: int, seed
             seconds[name] += time.perf_counter() - started
             scores[name] = [_score(trained, trial.scene, photo, poses, seed) for photo in trial.kept]
         gains.append([with_it - without for with_it, without in zip(scores["on"], scores["off"], strict=True)])
+        if default is not None and (-1 if default else 1) * mean(gains[-1]) < MIN_GAIN_DB:
+            break
     return Pilot(mean(map(mean, gains)), _noise(gains), seconds["on"] / seconds["off"] - 1)
 
 

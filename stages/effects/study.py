@@ -175,7 +175,8 @@ class _Study:
         self.fitting_pilots += fits_poses(off, on)
         words, default = self.found.of[effect.name].words, effect.part_of_the_method
         try:
-            pilot = pilots.run_pilot(self.trial, off, on, self.config.pilot_steps, self.config.seed, self.progress)
+            steps, seed = self.config.pilot_steps, self.config.seed
+            pilot = pilots.run_pilot(self.trial, off, on, steps, seed, self.progress, default)
         except NonFinite as fault:
             return Verdict(default, f"{words}; unclear, and the pilot diverged: {fault}")
         gain = f"a pilot gained {pilot.gain_db:+.2f} ± {pilot.noise_db:.2f} dB"

@@ -10,9 +10,13 @@ from stages.sfm.registration import OVERLAP_HINT
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "photos"), [("fountain_p11", 11), ("sceaux_castle", 11), ("fox", 50)])
+@pytest.mark.parametrize(("name", "photos"), [("fountain_p11", 11), ("sceaux_castle", 11), ("fox", 25)])
 def test_every_photo_is_registered(shared_data: Path, tmp_path: Path, name: str, photos: int):
-    assert run_command(["run", str(shared_data / name), "-o", str(tmp_path / "w.nerf"), "--until", "normalise"]) == 0
+    every = sorted(file for file in (shared_data / name / "images").iterdir() if file.suffix in {".jpg", ".JPG"})
+    (tmp_path / "photos").mkdir()
+    for file in every[:: len(every) // photos]:
+        (tmp_path / "photos" / file.name).symlink_to(file)
+    assert run_command(["run", str(tmp_path / "photos"), "-o", str(tmp_path / "w.nerf"), "--until", "normalise"]) == 0
     (account,) = (tmp_path / "w.nerf/sfm").glob("*/registration.json")
     registration = json.loads(account.read_text())
     assert (registration["registered"], registration["photos"]) == (photos, photos)

@@ -82,6 +82,54 @@ def test_validation_poses_are_fitted_wherever_poses_are_refined(
     assert asked == [fitted] * (2 * pilots.SEEDS * len(trial.kept))
 
 
+@pytest.mark.parametrize(
+    ("default", "gains", "pairs"),
+    [
+        (False, (0.05, 0.5, 0.5), 1),
+        (False, (0.5, -0.2, 0.5), 2),
+        (False, (0.5, 0.4, 0.5), 3),
+        (True, (0.5, -0.5, -0.5), 1),
+        (True, (-0.5, -0.4, -0.5), 3),
+        (None, (0.0, 0.0, 0.0), 3),
+    ],
+)
+def test_a_pilot_ends_when_no_change_is_to_come(
+    trial: PilotScene, monkeypatch: pytest.MonkeyPatch, default: bool | None, gains: tuple[float, ...], pairs: int
+) -> None:
+    arms = list[tuple[str, int]]()
+
+    def trained(_trial: object, arm: Decisions, steps: int, seed: int) -> tuple[str, int]:
+        if steps > 1:  # not the warm-up
+            arms.append(("on" if "exposure" in arm.on else "off", seed))
+        return ("on" if "exposure" in arm.on else "off", seed)
+
+    monkeypatch.setattr(pilots, "_trained", trained)
+    monkeypatch.setattr(pilots, "_score", lambda arm, *_: 20 + (gains[arm[1]] if arm[0] == "on" else 0))
+    pilot = run_pilot(trial, PLAIN, PLAIN.having("exposure"), 2, 0, SilentDisplay(), default)
+    assert sorted(arms) == sorted((arm, seed) for arm in ("on", "off") for seed in range(pairs))
+    assert pilot.gain_db == pytest.approx(np.mean(gains[:pairs]))
+
+
+def test_an_ended_pilot_would_have_proved_little() -> None:
+    """Whatever the other seeds gain: of those that ended with the first one, none shows 0.2 dB."""
+    others = np.arange(-1, 3, 0.01)
+    first = np.full((len(others), len(others)), pilots.MIN_GAIN_DB)
+    seeds = np.stack([first, *np.meshgrid(others, others)])
+    mean, noise = seeds.mean(axis=0), 4.303 / 3**0.5 * seeds.std(axis=0, ddof=1)
+    assert 0.15 < mean[mean > noise].max() < 0.2
+
+
+def test_a_photo_kept_back_is_drawn_thinly(
+    inputs: dict[str, Path], trial: PilotScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert trial.kept[0].colours.shape == (45, 60, 3), "a small one whole"
+    monkeypatch.setattr(pilots, "LONG_SIDE", 200)
+    large = pilot_scene(inputs, read_scene(inputs["normalise"]), SilentDisplay())
+    assert isinstance(large, PilotScene)
+    photo = large.kept[0]
+    assert max(photo.colours.shape[:2]) == pilots.DRAWN_SIDE and photo.rays.near.shape == photo.colours.shape[:2]
+
+
 @pytest.mark.parametrize(("device", "fit"), [("cpu", 0.02), ("cuda", 0.5)])
 def test_pilots_are_predicted_by_steps_and_fitted_poses(
     inputs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, device: str, fit: float
@@ -93,7 +141,7 @@ def test_pilots_are_predicted_by_steps_and_fitted_poses(
     monkeypatch.setattr(pilots, "seconds_per_step", lambda *given: on[given[-1]])
     scene = read_scene(inputs["normalise"])
     without, fitting = pilots.expected_seconds(scene, 100)
-    assert without == pytest.approx(1.3 * 6 * 100 * 0.02)
+    assert without == pytest.approx(1.4 * 6 * 100 * 0.02)
     of_fits = 6 * 4 * pilots.STEPS_PER_FIT * 4 * fit  # of a step's four chunks each on one core
     assert fitting - without == pytest.approx(of_fits)
 
