@@ -2,6 +2,7 @@
 
 import os
 import threading
+import time
 import traceback
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ KEYS = {
 }
 GRID: dict[str, Any] = {"num_levels": 2, "log2_hashmap_size": 10, "max_res": 32, "target_samples": 1024}
 MANY_STEPS = 1_000_000
+PAUSE_SECONDS = 0.02  # between steps: it leaves the cores to who looks on, a browser that draws in software
 
 
 def manifest_of(stage: str, folder: Path, result: StageResult, inputs: dict[str, str] | None = None) -> Manifest:
@@ -79,6 +81,7 @@ class RunningTraining:
             def step_unless_over(number: int, progress: float, lr_scale: float) -> StepResult:
                 if self.over:
                     raise Over
+                time.sleep(PAUSE_SECONDS)
                 return step(number, progress, lr_scale)
 
             trainer.step = step_unless_over  # pyright: ignore[reportAttributeAccessIssue]
