@@ -4,9 +4,9 @@ Both arms have the same seed, rays and number of steps and differ in nothing but
 an exposure (and, where an arm refines poses, a pose) of their own, which neither arm knows: so they are scored by the
 half-image protocol, fitted on the left half and scored on the right one.
 
-A pilot ends with the first seed that speaks against a change. For the mean of three seeds to be more than its noise,
-4.3 standard deviations / √3, none of them may gain much less than the others: where one gains less than MIN_GAIN_DB,
-what the others could still prove is a gain below 0.2 dB.
+A pilot ends with the first seed that speaks against a change, and changes nothing then. For the mean of three seeds to
+be more than its noise, 4.3 standard deviations / √3, none of them may gain much less than the others: where one gains
+less than MIN_GAIN_DB, what three could prove is a gain below 0.2 dB.
 """
 
 import time
@@ -38,7 +38,7 @@ from stages.train.planning import seconds_per_step
 from stages.train.validation_images import split_off_validation
 
 LONG_SIDE = 200  # pixels of the photos in a pilot
-DRAWN_SIDE = 100  # of a photo kept back: drawing all of its pixels takes as long as training, and says the same
+SCORED_SIDE = 100  # of a validation image: rendering all of its pixels takes as long as training, and says the same
 MAX_KEPT = 4  # of the training photos, to judge by; with fewer than MIN_FOR_INTERVAL their own noise is not known
 SEEDS = 3  # at most
 TARGET_SAMPLES = 1 << 13  # half the usual: a pilot has to be short, and is judged early
@@ -51,22 +51,24 @@ MIN_GAIN_DB = 0.1  # a gain must exceed its noise, and this, which nobody sees
 
 
 class Pilot(NamedTuple):
-    """What switching an effect on gained on the photos kept back, in dB: the mean, and half of its 95 % interval, over
-    seeds or over photos, whichever is wider. ``cost`` is the share by which it made training slower."""
+    """What switching an effect on gained on the validation images, in dB: the mean, and half of its 95 % interval, over
+    photos or, of SEEDS seeds, over seeds, whichever is wider. ``cost`` is the share by which it made training slower;
+    ``seeds``: how many were trained."""
 
     gain_db: float
     noise_db: float
     cost: float
+    seeds: int = SEEDS
 
     @property
     def pays(self) -> bool:
-        """Whether the gain is more than its noise."""
-        return self.gain_db > max(self.noise_db, MIN_GAIN_DB)
+        """Whether the gain is more than its noise: fewer seeds than SEEDS know none."""
+        return self.seeds == SEEDS and self.gain_db > max(self.noise_db, MIN_GAIN_DB)
 
     @property
     def hurts(self) -> bool:
         """Whether leaving it out would gain as clearly."""
-        return -self.gain_db > max(self.noise_db, MIN_GAIN_DB)
+        return self.seeds == SEEDS and -self.gain_db > max(self.noise_db, MIN_GAIN_DB)
 
 
 class _Photo(NamedTuple):
@@ -125,8 +127,8 @@ def pilot_scene(inputs: Inputs, scene: Scene, progress: Progress) -> PilotScene 
 
 
 def _thinned(photo: _Photo) -> _Photo:
-    """Rows and columns of a photo, evenly spread, so that its longer side has about DRAWN_SIDE pixels."""
-    stride = max(1, round(max(photo.colours.shape[:2]) / DRAWN_SIDE))
+    """Rows and columns of a photo, evenly spread, so that its longer side has about SCORED_SIDE pixels."""
+    stride = max(1, round(max(photo.colours.shape[:2]) / SCORED_SIDE))
     rays = photo.rays.each(lambda part: part[::stride, ::stride])
     used = None if photo.used is None else photo.used[::stride, ::stride]
     return photo._replace(rays=rays, colours=photo.colours[::stride, ::stride], used=used)
@@ -175,7 +177,7 @@ def run_pilot(
         gains.append([with_it - without for with_it, without in zip(scores["on"], scores["off"], strict=True)])
         if default is not None and (-1 if default else 1) * mean(gains[-1]) < MIN_GAIN_DB:
             break
-    return Pilot(mean(map(mean, gains)), _noise(gains), seconds["on"] / seconds["off"] - 1)
+    return Pilot(mean(map(mean, gains)), _noise(gains), seconds["on"] / seconds["off"] - 1, len(gains))
 
 
 def _noise(gains: list[list[float]]) -> float:

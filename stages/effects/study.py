@@ -179,7 +179,8 @@ class _Study:
             pilot = pilots.run_pilot(self.trial, off, on, steps, seed, self.progress, default)
         except NonFinite as fault:
             return Verdict(default, f"{words}; unclear, and the pilot diverged: {fault}")
-        gain = f"a pilot gained {pilot.gain_db:+.2f} ± {pilot.noise_db:.2f} dB"
+        seeds = "" if pilot.seeds == pilots.SEEDS else f" with {pilot.seeds} of {pilots.SEEDS} seeds"
+        gain = f"a pilot gained {pilot.gain_db:+.2f} ± {pilot.noise_db:.2f} dB{seeds}"
         stays = not pilot.hurts if default else pilot.pays
         return Verdict(stays, f"{words}; {gain}", pilot)
 

@@ -130,7 +130,7 @@ def _otsu_level(grid: DensityGrid, stopped: float) -> IsoLevel:
     values = grid.values.cpu().numpy()
     level = float(np.exp(threshold_otsu(np.log(values[values > 1e-3 * values.max()]))))
     reason = (
-        f"only {stopped:.1%} of the photos' rays lose half of their transmittance in the box, so the field is still "
-        "fog; Otsu's threshold on its log density is used"
+        f"only {stopped:.1%} of the photos' rays lose half of their transmittance in the box, so the field has "
+        "no surface yet; Otsu's threshold on its log density is used"
     )
     return IsoLevel(level, reason, None, False)

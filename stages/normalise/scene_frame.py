@@ -204,7 +204,7 @@ def _scene(
 
 
 def _points(model: SparseModel, sfm: Reconstruction, found: Normalisation) -> dict[str, np.ndarray]:
-    """points.safetensors, as docs/ARCHITECTURE.md lists it."""
+    """points.safetensors, as docs/FILES.md lists it."""
 
     return {
         "xyz": found.scene_from_sfm.points(model.xyz).astype(np.float32),

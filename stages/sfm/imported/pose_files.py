@@ -1,9 +1,9 @@
 """Imported poses: transforms.json, Blender's transforms_train/test.json, COLMAP models, LLFF's file.
 
 Poses in transforms files are world_from_camera with OpenGL axes (x right, y up, z backward), in COLMAP models
-camera_from_world with OpenCV axes, unless the user says otherwise; here they become world_from_camera with OpenCV axes.
-Photos are told apart by their own names, as ingest noted them. Cameras of photos as their files store them are turned
-upright as ingest turned the photos.
+camera_from_world with OpenCV axes, unless the user says otherwise; each reader makes them world_from_camera with OpenCV
+axes. Photos are told apart by their own names, as ingest noted them. Cameras of photos as their files store them are
+turned upright as ingest turned the photos.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ def read_poses(
     """Read ``cameras`` and match them to ``photos``. ``frames`` maps a transforms file's file_path to a photo's name.
 
     Raises StageError, naming the frame, for anything that is no camera: numbers that are not finite, a focal length
-    that is not positive, a rotation that is scaled or mirrored; and where no frame has a photo.
+    that is not positive, a rotation that is sheared or mirrored; and where no frame has a photo.
     """
     convention = convention.with_defaults(convention_of_format(cameras))
     if cameras.suffix.lower() == LLFF:

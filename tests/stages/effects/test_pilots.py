@@ -107,7 +107,8 @@ def test_a_pilot_ends_when_no_change_is_to_come(
     monkeypatch.setattr(pilots, "_score", lambda arm, *_: 20 + (gains[arm[1]] if arm[0] == "on" else 0))
     pilot = run_pilot(trial, PLAIN, PLAIN.having("exposure"), 2, 0, SilentDisplay(), default)
     assert sorted(arms) == sorted((arm, seed) for arm in ("on", "off") for seed in range(pairs))
-    assert pilot.gain_db == pytest.approx(np.mean(gains[:pairs]))
+    assert pilot.gain_db == pytest.approx(np.mean(gains[:pairs])) and pilot.seeds == pairs
+    assert (pilot.pays, pilot.hurts) == (pairs == 3 and default is False, pairs == 3 and default is True)
 
 
 def test_an_ended_pilot_would_have_proved_little() -> None:
@@ -119,7 +120,7 @@ def test_an_ended_pilot_would_have_proved_little() -> None:
     assert 0.15 < mean[mean > noise].max() < 0.2
 
 
-def test_a_photo_kept_back_is_drawn_thinly(
+def test_a_validation_image_is_rendered_thinly(
     inputs: dict[str, Path], trial: PilotScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert trial.kept[0].colours.shape == (45, 60, 3), "a small one whole"
@@ -127,7 +128,7 @@ def test_a_photo_kept_back_is_drawn_thinly(
     large = pilot_scene(inputs, read_scene(inputs["normalise"]), SilentDisplay())
     assert isinstance(large, PilotScene)
     photo = large.kept[0]
-    assert max(photo.colours.shape[:2]) == pilots.DRAWN_SIDE and photo.rays.near.shape == photo.colours.shape[:2]
+    assert max(photo.colours.shape[:2]) == pilots.SCORED_SIDE and photo.rays.near.shape == photo.colours.shape[:2]
 
 
 @pytest.mark.parametrize(("device", "fit"), [("cpu", 0.02), ("cuda", 0.5)])
