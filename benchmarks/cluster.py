@@ -83,7 +83,11 @@ def main() -> None:
             with killing() if kill else nullcontext(list[int]()) as killed:
                 digest, figures = run(given.stage, workspace, *options)
             digests.append(digest)
-            names = {"set": (given.photos.parent if given.photos.name == "images" else given.photos).name, "stage": given.stage, "where": "cluster" if options else "this machine"}
+            names = {
+                "set": (given.photos.parent if given.photos.name == "images" else given.photos).name,
+                "stage": given.stage,
+                "where": "cluster" if options else "this machine",
+            }
             record.add(**names, killed=len(killed), **figures, same="yes" if digest == digests[0] else "no")
             return len(killed)
 

@@ -73,7 +73,7 @@ class Config(StageConfig):
 
 
 def expected_seconds(config: Config, workload: Workload) -> float:
-    """Reading the photos, two or three seconds, and a quarter of a minute for each pilot, of which most sets have one."""
+    """Reading the photos, two or three seconds, and a quarter of a minute for a pilot, of which most sets have one."""
     return 20.0 + workload.photos.reading_seconds(workload.cores)
 
 

@@ -141,8 +141,8 @@ def fits_poses(off: Decisions, on: Decisions) -> bool:
 
 
 def expected_seconds(scene: Scene, steps: int) -> tuple[float, float]:
-    """What a pilot of all seeds takes here: its trainings, by a few steps of a fresh field, and what goes on beside them;
-    and what such a pilot takes that fits poses, too."""
+    """What a pilot of all seeds takes here: its trainings, by a few steps of a fresh field, and what goes on beside
+    them; and what such a pilot takes that fits poses, too."""
     arm, device = Decisions({"view_dependence": {}} | ({} if scene.has_alpha else {"background": {}})), compute_device()
     per_step = seconds_per_step(_config(arm, scene, steps, device), scene, arm, device)
     trainings = (1 + BESIDE_TRAINING) * 2 * SEEDS * steps * per_step
