@@ -106,10 +106,10 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     pilots = min(MAX_PILOTS, int(config.seconds / took))
     more = (config.seconds - pilots * took) / (fitting - took)
     if pilots < MAX_PILOTS:
-        count = "none" if not pilots else "one at most"
         progress.note(
             "effects.few-pilots",
-            f"a pilot takes about {duration(took)} here, and {duration(config.seconds)} are available: {count}",
+            f"time allows {pilots} of up to {MAX_PILOTS} pilots (A/B training runs): one takes up to {duration(took)} "
+            f"here, and {duration(config.seconds)} are available",
         )
     return config.model_copy(update={"pilots": pilots, "fitting_pilots": min(pilots, int(more))})
 

@@ -41,8 +41,8 @@ def affordable_fraction(config: "Config", inputs: Inputs, progress: Progress) ->
     if fraction < 1:
         progress.note(
             "evaluate.some-pixels",
-            f"{short_count(speed)} rays/s here: all pixels of {len(test)} test photos take about {duration(whole)}, "
-            f"{time_budget.message()}; --evaluate.fraction 1 scores all",
+            f"only part of the pixels of {len(test)} test photos is scored: all would take about {duration(whole)} at "
+            f"{short_count(speed)} rays/s, {time_budget.message()}; --evaluate.fraction 1 scores all",
         )
     return fraction
 

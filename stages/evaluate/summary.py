@@ -32,7 +32,8 @@ def overall(images: list[dict[str, Any]], test_photos: int, notes: list[Note]) -
         what = f"no interval: {photos_in_words(len(images))} cannot show how much the figures vary"
         more.append(Note("evaluate.no-interval", what))
     if small := sum(image["psnr_right_half"] is None for image in images):
-        what = f"half of {photos_in_words(small)} has too few pixels to fit an exposure or to score it"
+        why = "a half has too few pixels to fit an exposure or to score it"
+        what = f"no half-image PSNR of {photos_in_words(small)}: {why}"
         more.append(Note("evaluate.small-halves", what))
     return metrics | {
         "lpips": None,

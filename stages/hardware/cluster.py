@@ -203,7 +203,7 @@ def _result(cluster: Cluster, reference: Any) -> Any:
             raise _lost(cluster) from error
         raise error.cause from None  # as it would have been raised here
     except (errors.WorkerCrashedError, errors.OutOfMemoryError) as error:
-        what = "a piece of work ended its process on the cluster again and again"
+        what = "a task on the cluster failed again and again: its process died each time"
         why = f"most likely a machine's memory ran out ({_first_line(error)})"
         raise StageError("hardware.cluster-work-lost", what, why, RESUME_HINT) from error
     except errors.RayError as error:

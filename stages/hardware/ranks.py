@@ -59,7 +59,7 @@ def check_ranks(devices: int, micro_batches: int) -> None:
     if devices not in (1, size):
         raise StageError(
             "hardware.two-launchers",
-            "two numbers of devices",
+            "torchrun and --train.devices ask for different numbers of devices",
             f"torchrun started {launcher} processes, --train.devices asks for {devices}",
             "Leave out --train.devices, or torchrun.",
         )

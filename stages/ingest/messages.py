@@ -137,7 +137,7 @@ def excluded_by_values(files: Sequence[str]) -> list[Note]:
     if not files:
         return []
     count, named = _count(files), _first_names(files)
-    words = f"{count} excluded as depth maps, with grey values of 16 bits or floats among colour photos: {named}"
+    words = f"{count} excluded as depth maps: grey values of 16 bits or floats among colour photos: {named}"
     return [Note("ingest.depth-maps", words)]
 
 
@@ -146,8 +146,8 @@ def excluded_masks(files: Sequence[str]) -> list[Note]:
     if not files:
         return []
     count, named = _count(files), _first_names(files)
-    words = f"{count} excluded as masks, black and white among photos: {named}. To use masks, whose black is ignored"
-    return [Note("ingest.black-and-white", f"{words}, name them masks/NAME.png after their photos")]
+    words = f"{count} excluded as masks, because they are pure black and white: {named}. To use them, name each"
+    return [Note("ingest.black-and-white", f"{words} masks/NAME.png after its photo; black is ignored")]
 
 
 def _count(files: Sequence[str]) -> str:
@@ -202,7 +202,8 @@ def note_masks(ignored: Sequence[float], turned: int, resized: int, photos: int,
     polarity = "; black is ignored: invert your masks if white marks what to ignore" if share > MANY_IGNORED else ""
     progress.note(
         "ingest.masks",
-        f"masks ignore {share:.0%} of {len(ignored)} of {photos} photos{turned_words}{resized_words}{polarity}",
+        f"{len(ignored)} of {photos} photos have masks, which ignore {share:.0%} of their pixels"
+        f"{turned_words}{resized_words}{polarity}",
     )
 
 
@@ -229,8 +230,8 @@ def taken_as_upright(names: Sequence[str]) -> list[Note]:
     """A note on photos that EXIF turned and whose masks fit them turned or not."""
     if not names:
         return []
-    which = f"masks of {len(names)} photos fit both with and without the EXIF orientation"
-    words = f"{which} and are used as upright ones. Check the masks of {_few([shown(name) for name in names])}"
+    which = f"the masks of {len(names)} photos fit both upright and before EXIF rotation"
+    words = f"{which}; they are taken as upright. Check the masks of {_few([shown(name) for name in names])}"
     return [Note("ingest.ambiguous-masks", words)]
 
 
@@ -268,7 +269,10 @@ def too_few(source: Source, names: Sequence[str], rejected: Sequence[Rejection])
             HINT,
         )
     return StageError(
-        "ingest.one-photo", "there is only one photo", f"a scene needs at least two, and there is only {only}", HINT
+        "ingest.one-photo",
+        "there is only one photo",
+        f"{only} is the only photo, and a scene needs at least three",
+        HINT,
     )
 
 

@@ -90,8 +90,8 @@ def take_frames(video: Path, most: int, folder: Path, progress: Progress) -> lis
     way = frames[-1].path
     progress.note(
         "ingest.frames-taken",
-        f"took {len(chosen)} of {len(frames)} frames: the sharpest of each time the image moves by about "
-        f"{way / (len(chosen) - 1):.0%} of its width; it moves by {way:.1f} widths in all",
+        f"took {len(chosen)} of {len(frames)} frames: the sharpest after each image motion of about "
+        f"{way / (len(chosen) - 1):.0%} of the image width; the whole motion is {way:.1f} widths",
     )
     return list(_write(video, frames, chosen, filters, folder, progress))
 

@@ -21,7 +21,7 @@ from stages.mesh.cleaning import Cleaned, boundary, clean
 from stages.mesh.decimation import decimate
 from stages.mesh.files import WRITERS, Z_UP_TO_Y_UP, ColouredMesh
 from stages.mesh.holes import Closed, close_holes
-from stages.mesh.iso_level import RETRAIN, IsoLevel, check_range, choose_iso_level
+from stages.mesh.iso_level import DIVERGED_HINT, IsoLevel, check_range, choose_iso_level
 from stages.mesh.marching_cubes import extract_surface
 from stages.mesh.preview import SMALL_COPY, preview, small_copy
 from stages.mesh.resolution import CHUNK, grid_box, point_cost, points_per_edge, slab_factor
@@ -207,7 +207,7 @@ def vertex_colours(
     found = torch.cat(colours)
     if broken := int((~found.isfinite()).any(dim=1).sum()):
         why = f"those of {broken} of {len(found)} vertices are NaN or infinite"
-        raise StageError("mesh.colours-not-finite", "the field's colours are not finite", why, RETRAIN)
+        raise StageError("mesh.colours-not-finite", "the field's colours are not finite", why, DIVERGED_HINT)
     return (found.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 

@@ -29,6 +29,7 @@ NUM_CANDIDATES = 17  # over three decades: neighbours differ by a factor of 1.5
 STRIDES = (4, 2, 1)  # every fourth candidate is tried, then those next to the best, closer and closer
 MIN_STOPPED = 0.01  # fraction of rays below which the photos say too little about the surface
 RETRAIN = "Train for longer (--train.steps or --train.seconds)."
+DIVERGED_HINT = "The field has diverged: train again with a tenth of --train.learning-rate."
 
 
 class IsoLevel(NamedTuple):
@@ -53,7 +54,7 @@ def check_range(grid: DensityGrid, iso_level: float | None) -> None:
             "mesh.density-not-finite",
             "the density is not finite",
             f"{broken} of {grid.values.numel()} grid points are NaN or infinite",
-            "Train again: the field has diverged.",
+            DIVERGED_HINT,
         )
     low, high = float(grid.values.min()), float(grid.values.max())
     opacity = 1 - float(torch.exp(-high * (grid.high - grid.low).norm()))

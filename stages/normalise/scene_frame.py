@@ -88,7 +88,7 @@ def _check(config: "Config", views: int) -> None:
     if views < MIN_VIEWS:
         raise StageError(
             "normalise.few-photos",
-            f"only {views} photo{'s' * (views != 1)} with a known camera",
+            f"only {views} registered photo{'s' * (views != 1)}",
             f"a scene needs at least {MIN_VIEWS}: two for training and one for testing",
             "Add photos that overlap with these.",
         )
@@ -115,7 +115,7 @@ def _has_alpha(photos: list[Photo], progress: Progress, tracked: bool) -> bool:
             f"{opaque} of {len(photos)} photos have no transparent parts and count as opaque",
         )
     elif transparent and not has_alpha:
-        why = "most photos have none" if transparent <= opaque else "what is opaque is seen whole in few"
+        why = "most photos have none" if transparent <= opaque else "few photos show the opaque object whole"
         progress.note(
             "normalise.alpha-ignored",
             f"transparent parts of {transparent} of {len(photos)} photos are ignored like masked ones: {why}",

@@ -267,7 +267,7 @@ def _compare_with_gps(gps: Reference, metres: float, progress: Progress) -> None
     if apart > max(MAX_ERROR, MAX_STANDARD_ERRORS * gps.relative_error):
         progress.note(
             "scale.gps-disagrees",
-            f"GPS says 1 unit = {_with_error(gps)}, {apart:.0%} off what the given lengths say: these are used",
+            f"GPS says 1 unit = {_with_error(gps)}, {apart:.0%} off what the given lengths say: the lengths are used",
         )
 
 

@@ -90,7 +90,8 @@ def _extract(database: Path, extraction: ExtractionOptions, state: JobState) -> 
 
 
 def _tell_few(state: JobState, median: float) -> None:
-    what = f"the photos yield few features, {median:,.0f} each: features are extracted from four times the pixels"
+    few = f"the photos yield few features (median {median:,.0f})"
+    what = f"{few}: extracting from photos enlarged to four times the pixels"
     state.send(note=Note("sfm.features-enlarged", what))
 
 

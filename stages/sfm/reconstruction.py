@@ -238,10 +238,8 @@ def _georeference(folder: Path, photos: Sequence[Photo], progress: Progress) -> 
     if isinstance(found, str):
         progress.note("sfm.no-gps-scale", f"the photos' GPS gives no metric scale: {found}")
         return None
-    scale = f"one unit is {found.enu_from_sfm.scale:.3g} m"
-    progress.note(
-        "sfm.gps-scale", f"by GPS of {found.used} photos {scale}; the median position error is {found.error_m:.1f} m"
-    )
+    scale = f"GPS of {found.used} photos gives the scale: one unit is {found.enu_from_sfm.scale:.3g} m"
+    progress.note("sfm.gps-scale", f"{scale}; the median position error is {found.error_m:.1f} m")
     return found.to_json()
 
 

@@ -214,14 +214,14 @@ def _reason(
         uncertain = f"its pose is uncertain: {agreeing} of its {seen} matches with points of the model agree on one"
         return Note("sfm.unregistered-uncertain-pose", uncertain)
     if seen >= MIN_POSE_INLIERS:
-        agree = f"{agreeing} of {seen} agree on one pose, and it takes {MIN_POSE_INLIERS}"
+        agree = f"{agreeing} of {seen} agree on one pose, and at least {MIN_POSE_INLIERS} must"
         return Note("sfm.unregistered-contradictions", f"its matches contradict each other: {agree}")
     pairs = f"all {int(in_model.sum())} of its pairs with registered photos"
     if matches.forward[mine][in_model].all():
         return Note("sfm.unregistered-forward-motion", f"forward motion in {pairs}: too little parallax")
     if matches.planar[mine][in_model].all():
         return Note("sfm.unregistered-rotation-or-plane", f"pure rotation or a planar scene in {pairs}")
-    points = f"only {seen} of its features match points of the model, and it takes {MIN_POSE_INLIERS}{few}"
+    points = f"only {seen} of its features match points of the model; it needs {MIN_POSE_INLIERS}{few}"
     return Note("sfm.unregistered-few-points", points)
 
 
@@ -264,7 +264,7 @@ def _no_depth(what: str, photos: Sequence[Photo], matches: Matches) -> StageErro
             "sfm.pure-rotation",
             what,
             f"pure rotation: {rotations} of {count} matching pairs differ by a rotation alone",
-            "Move sideways between photos, by a tenth of the distance to the scene, instead of only turning it.",
+            "Move the camera sideways between photos, by a tenth of the distance to the scene. Do not only turn it.",
         )
     if forward > count / 2:
         return StageError(

@@ -146,7 +146,7 @@ def train_and_score(run: Run, benchmark: Benchmark, inputs: Inputs, folder: Path
         except StageError as error:
             if error.code not in RUN_FAILURES:
                 what = f"the study stopped at {run.label}: {error.what}"
-                hint = "Close other programs or free disk space; the same command then continues with this training."
+                hint = f"{error.hint} The same command then continues with this training."
                 raise StageError("tradeoff.stopped", what, error.why, hint) from error
             figures["failed"] = f"{error.what}: {error.why}"
         else:

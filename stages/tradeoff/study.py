@@ -185,7 +185,8 @@ def run_study(config: "Config", inputs: Inputs, folder: Path, progress: Progress
     if len(failed) == len(results):
         why = "; ".join(dict.fromkeys(str(figures["failed"]) for _, figures in results))
         why = why or f"even {schedule.left_out[0]} takes longer than {duration(config.seconds)} here"
-        raise StageError("tradeoff.no-result", "the study has no result", why, "Give it more time, e.g. --budget 30m.")
+        hint = "Correct what stopped the runs; if time ran out, give more, e.g. --budget 30m."
+        raise StageError("tradeoff.no-result", "the study has no result", why, hint)
     return Outcome(results, (*schedule.left_out, *list_runs(late), *failed), existing, benchmark)
 
 

@@ -73,7 +73,7 @@ def ranks_of(config: Config, inputs: Inputs) -> Iterator[Ranks | None]:
         yield None
         return
     if config.kind != "grid":
-        why = "data-parallel training is of the hash-grid field alone"
+        why = "only the hash-grid field supports data-parallel training"
         raise StageError(
             "train.one-device", f"the {config.kind} field trains on one device", why, "Leave out torchrun."
         )
@@ -142,7 +142,7 @@ def prepare(
     dataset = _dataset(config, scene, inputs, progress)
     if dataset.depth_maps is not None:
         known = float((dataset.depth_maps.distance > 0).float().mean())
-        progress.note("train.depth-maps", f"depth maps know the distance of {known:.0%} of the pixels")
+        progress.note("train.depth-maps", f"depth maps cover {known:.0%} of the pixels")
     background = torch.tensor(field_background(config, scene), device=device)
 
     evaluation_sets = EvaluationSets(

@@ -70,8 +70,8 @@ def load(config: "Config", inputs: Inputs, progress: Progress) -> Contents:
     field, scene = read_json(inputs["train"] / "field.json"), read_scene(inputs["normalise"])
     renderer = load_renderer(inputs["train"], progress=progress)
     if not isinstance(renderer.field, HashGridField):
-        why = "the page draws hash-grid fields alone: a vanilla NeRF's network is over 100 times as much work a point"
-        progress.note("viewer.not-drawn", f"viewer.html says only that it cannot show this field: {why}")
+        why = "it renders only hash-grid fields, because a vanilla NeRF is over 100 times as much work per sample"
+        progress.note("viewer.not-rendered", f"viewer.html cannot show this field: {why}")
         return Contents({"field": None}, {}, None)
     if renderer.field.settings.features_per_level != FEATURES:
         raise StageError(

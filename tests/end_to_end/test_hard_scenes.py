@@ -156,7 +156,7 @@ def test_three_photos_of_which_one_is_held_out(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("photos", "code", "what"),
-    [(1, 10, "there is only one photo"), (2, 12, "only 2 photos with a known camera")],
+    [(1, 10, "there is only one photo"), (2, 12, "only 2 registered photos")],
 )
 def test_too_few_photos_are_refused(photos: int, code: int, what: str, tmp_path: Path) -> None:
     done = run(write_set(tmp_path / "set", RING[:photos]), tmp_path / "w.nerf")

@@ -108,7 +108,7 @@ def reasons(model: pycolmap.Reconstruction, checked: Checked) -> dict[str, Note]
             matches = (
                 f"{against:,.0f} of its {agree + against:,.0f} verified matches with other photos contradict its pose"
             )
-            together = f", and so for {groups - 1} more" if groups > 1 else ""
+            together = f"; {groups - 1} more failed the same check" if groups > 1 else ""
             found[model.image(image_id).name] = Note("sfm.unregistered-misplaced", f"{matches}{together}")
         elif unlinked:
             found[model.image(image_id).name] = Note(

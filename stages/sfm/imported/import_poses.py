@@ -112,8 +112,8 @@ def _other_focal_lengths(name: str, error_px: float, fit: FocalFit, model: Spars
         f"the focal lengths of {name} do not fit the photos",
         f"matches of the photos lie {error_px:.1f} px from where the cameras predict them, and {fit.error_px:.1f} px "
         f"with focal lengths {fit.factor:.2f} times as long",
-        f"Correct them, {given:.0f} px to about {fit.factor * given:.0f} px, or the size that they are of; or leave "
-        "out the cameras to find them from the photos: pipeline run FOLDER",
+        f"Change them from {given:.0f} px to about {fit.factor * given:.0f} px, or correct the image size that they "
+        "belong to; or leave out the cameras to find them from the photos: pipeline run FOLDER",
     )
 
 
@@ -175,7 +175,7 @@ def _note_doubts(
     elif not check["fits"]:
         progress.note(
             "sfm.cameras-inexact",
-            f"the cameras of {source} are inexact: matches of the photos lie {check['error_px']:.1f} px from where the "
-            f"cameras predict them, and {check['noise_px']:.1f} px from where two photos alone do. Check distortion "
-            "and principal point; or leave out the cameras to find them from the photos",
+            f"the cameras of {source} are inexact: the error of the matches is {check['error_px']:.1f} px with these "
+            f"cameras, and {check['noise_px']:.1f} px with the geometry of each pair alone. Check distortion and "
+            "principal point; or leave out the cameras to find them from the photos",
         )

@@ -257,11 +257,11 @@ def _check_shared(files: Sequence[Mapping[str, Any]], framed: Sequence[_Framed])
         shared = [shared_intrinsics(one.frame, file) for one in framed]
         where = f"the intrinsics of all frames, for photos of {len(stored)} sizes ({sizes})"
         if any("w" not in one and not one.keys().isdisjoint(IN_PIXELS) for one in shared):
-            why = "they are in pixels, and no w and h tell of which size"
-            raise unusable("sfm.shared-pixels", where, f"{why}: write w and h beside them, or intrinsics in each frame")
+            why = "they are in pixels, but w and h are missing"
+            raise unusable("sfm.shared-pixels", where, f"{why}: add w and h, or write the intrinsics in each frame")
         stand = {one.photo.height > one.photo.width for one, of in zip(framed, shared, strict=True) if is_one_angle(of)}
         if len(stand) > 1:
-            why = "one camera_angle_x cannot be that of photos that lie and of photos that stand"
+            why = "landscape and portrait photos cannot share one camera_angle_x"
             raise unusable("sfm.shared-angle", where, f"{why}: write it in each frame")
 
 

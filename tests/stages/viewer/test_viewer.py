@@ -147,7 +147,7 @@ def test_a_vanilla_nerf_has_a_page_that_says_why_not(tmp_path: Path):
     (tmp_path / "page").mkdir()
     result = run_stage(viewer, viewer.Config(), field.inputs, tmp_path / "page", progress)
     text = (tmp_path / "page/viewer.html").read_text("utf-8")
-    assert progress.codes == ["viewer.not-drawn"] and result.facts == {"drawn": False}
+    assert progress.codes == ["viewer.not-rendered"] and result.facts == {"drawn": False}
     assert "vanilla NeRF" in text and "<script" not in text
 
 

@@ -247,7 +247,7 @@ def test_camera_models_have_other_names(read, declared: dict[str, Any], model: s
 
 def test_intrinsics_for_photos_of_several_sizes_have_a_size(read) -> None:
     photos = [photo(0), photo(1, W // 2, H // 2), photo(2)]
-    with refused("sfm.shared-pixels", "30×20, 60×40", "no w and h"):
+    with refused("sfm.shared-pixels", "30×20, 60×40", "w and h are missing"):
         read([frame(0), frame(1, w=W // 2, h=H // 2), frame(2)], photos=photos, **LENS)
     known = read([frame(i) for i in range(3)], photos=photos, w=W, h=H, **LENS)
     own = read(
