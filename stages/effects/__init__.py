@@ -73,8 +73,8 @@ class Config(StageConfig):
 
 
 def expected_seconds(config: Config, workload: Workload) -> float:
-    """Reading the photos, two or three seconds, and a quarter of a minute for a pilot, of which most sets have one."""
-    return 20.0 + workload.photos.reading_seconds(workload.cores)
+    """Reading the photos, three seconds, and a quarter of a minute for a pilot, of which every second set has one."""
+    return 10.0 + workload.photos.reading_seconds(workload.cores)
 
 
 def budget_seconds(left: BudgetLeft) -> float:

@@ -105,7 +105,7 @@ def test_fog_is_split_into_thick_and_thin_and_called_fog(rays):
     chosen = choose_iso_level(density_grid_of(model), model, rays)
     assert chosen.surface_error_voxels is None and not chosen.well_defined
     assert 0.002 < chosen.density < 0.022
-    assert chosen.reason.startswith("only 0.0% of the photos' rays") and "still fog" in chosen.reason
+    assert chosen.reason.startswith("only 0.0% of the photos' rays") and "no surface yet" in chosen.reason
 
 
 def test_rays_that_all_miss_the_box_leave_fog(rays):

@@ -323,7 +323,7 @@ def test_fog_becomes_a_mesh_that_says_it_is_fog(run_mesh, progress):
     result, _ = run_mesh(Solid(ball, inside=0.3))
     assert result.facts["faces"] > 100 and result.facts["surface_error_voxels"] is None
     assert result.line.endswith("; the field has no clear surface yet, train for longer")
-    assert progress.names("mesh.iso-level", "fog")
+    assert progress.names("mesh.iso-level", "no surface yet")
 
 
 def test_the_level_asked_for_is_taken(run_mesh):
