@@ -29,7 +29,7 @@ NUM_CANDIDATES = 17  # over three decades: neighbours differ by a factor of 1.5
 STRIDES = (4, 2, 1)  # every fourth candidate is tried, then those next to the best, closer and closer
 MIN_STOPPED = 0.01  # fraction of rays below which the photos say too little about the surface
 RETRAIN = "Train for longer (--train.steps or --train.seconds)."
-DIVERGED_HINT = "The field has diverged: train again with a tenth of --train.learning-rate."
+DIVERGED_HINT = "Train again with a tenth of --train.learning-rate: the field has diverged."
 
 
 class IsoLevel(NamedTuple):

@@ -73,7 +73,7 @@ def reason(config: Config, rays: float) -> str:
     """What sizes that were left open are chosen for."""
     budget = f"{config.seconds:g} s on this machine" if config.steps is None else f"{config.steps:,} steps"
     work = field_of(config).work(config, rays)
-    return f"{budget} suffice for about {short_count(rays)} rays{work}; sizes that no option sets follow from that"
+    return f"{budget} render about {short_count(rays)} rays{work}; sizes that no option sets follow from that"
 
 
 def _used_shares(ingest: Path, scene: "Scene") -> dict[str, float]:

@@ -259,7 +259,7 @@ def test_masks_go_with_their_photos(tmp_path: Path, progress: Any) -> None:
         assert np.array_equal(mask, np.broadcast_to(np.where(np.arange(32) < columns, 0, 255), (24, 32)))
     assert progress.codes == ["ingest.stray-masks", "ingest.masks"]
     assert progress.names("ingest.stray-masks", "masks/stranger.png")
-    assert progress.names("ingest.masks", "42% of 3 of 6 photos", "1 are turned", "1 are resized")
+    assert progress.names("ingest.masks", "3 of 6 photos", "42%", "1 are turned", "1 are resized")
 
 
 def test_a_photo_whose_mask_cannot_be_used_is_refused(tmp_path: Path, progress: Any) -> None:

@@ -58,7 +58,7 @@ def test_frames_are_picture_steps_apart_and_pauses_one(tmp_path: Path, progress:
     assert steps.min() >= STEP / 2 - 1e-6 and steps.max() <= 1.5 * STEP + 1e-6
     assert ways[frames[0].number] < STEP / 2 and ways[frames[-1].number] > 0.8 - STEP / 2
     assert progress.codes == ["ingest.frames-taken"]
-    step = f"{0.8 / (len(frames) - 1):.0%} of its width"
+    step = f"{0.8 / (len(frames) - 1):.0%} of the image width"
     assert progress.names("ingest.frames-taken", f"{len(frames)} of 56 frames", step, "0.8 widths")
     assert progress.updates[0] == ("examined 10 frames of a.mp4", pytest.approx(10 / 112))
     assert progress.updates[-1] == (f"writing {len(frames)} frames", 1.0)

@@ -251,7 +251,7 @@ def test_a_given_region_replaces_the_automatic_one(inputs, progress) -> None:
 
 
 def test_two_photos_are_too_few(inputs, progress) -> None:
-    with refused("normalise.few-photos", "2 photos", 3):
+    with refused("normalise.few-photos", "2 registered photos", 3):
         run(inputs(2), progress)
 
 
