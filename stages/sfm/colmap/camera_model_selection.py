@@ -6,8 +6,7 @@ bends the poses; one that is too rich fits noise, and bends them too.
 """
 
 from collections import Counter
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -16,7 +15,6 @@ import pycolmap
 from jaxtyping import Float, Int
 
 from stages.contract import Note
-from stages.hardware.device import processors
 from stages.sfm.colmap.camera_models import MODELS, CameraModelCandidate, degenerate_cameras, set_camera_models
 from stages.sfm.colmap.observations import Observations, noise_px, observations, residuals
 
@@ -103,7 +101,7 @@ def _select(
         if photos < 3:  # however many points there are
             why = "comparing camera models takes points that three photos of one camera see"
         return Selection(cameras, photos, None, [], why)
-    results = _results(sample, held_out, models, noise)
+    results = list(_results(sample, held_out, models, noise))
     cells = _cells(held_out, mapped)
     chosen, rows = _choose(results, cells)
     return Selection(cameras, photos, chosen, rows, _reason(chosen, results, cells))
@@ -170,15 +168,13 @@ def _cells(seen: Observations, model: pycolmap.Reconstruction) -> Int[np.ndarray
 
 def _results(
     sample: pycolmap.Reconstruction, held_out: Observations, models: Sequence[str], noise: float
-) -> list[CandidateResult]:
-    """Every candidate adjusted to the sample; with a refined principal point it goes on from where it was centred.
-    Models are adjusted side by side, each on one core, so that none depends on how many there are."""
+) -> Iterator[CandidateResult]:
+    """Every candidate adjusted to the sample; with a refined principal point it goes on from where it was centred."""
     trained = observations(sample)
     cameras = sorted({sample.image(i).camera_id for i in sample.reg_image_ids()})
     _adjust(sample, False, noise)  # most of the way is the same for all candidates
-
-    def adjusted(name: str) -> list[CandidateResult]:
-        model, found = pycolmap.Reconstruction(sample), list[CandidateResult]()
+    for name in models:
+        model = pycolmap.Reconstruction(sample)
         set_camera_models(model, dict.fromkeys(cameras, name))
         for principal_point in (False, True):
             _adjust(model, principal_point, noise)
@@ -186,13 +182,7 @@ def _results(
             error = np.where(length < CAP_PX, length, CAP_PX)  # a point behind the camera (NaN) counts as far off
             degenerate = list(degenerate_cameras(model).values())
             why = degenerate[0] if len(degenerate) > MAX_DEGENERATE_FRACTION * model.num_reg_images() else None
-            found.append(
-                CandidateResult(CameraModelCandidate(name, principal_point), error, noise_px(model, trained), why)
-            )
-        return found
-
-    with ThreadPoolExecutor(processors()) as pool:
-        return [result for found in pool.map(adjusted, models) for result in found]
+            yield CandidateResult(CameraModelCandidate(name, principal_point), error, noise_px(model, trained), why)
 
 
 def _adjust(model: pycolmap.Reconstruction, principal_point: bool, noise: float) -> None:
