@@ -21,7 +21,7 @@ from benchmarks.record import Record, add_out
 from nerf.geometry.rays import Rays
 from pipeline.engine.workspace import Workspace
 from stages import mesh
-from stages.contract import SilentProgress, plan_stage
+from stages.contract import Inputs, SilentProgress, plan_stage
 from stages.evaluate.image_metrics import ssim
 from stages.io.files import write_png
 from stages.io.pixels import load_pixels
@@ -104,19 +104,19 @@ def scores(image: np.ndarray, truth: np.ndarray, used: np.ndarray) -> tuple[floa
     return -10 * math.log10(max(error, 1e-10)), similarity
 
 
-def meshes_of(source: Source, train: Path, resolution: int) -> dict[str, tuple[ColouredMesh, bool]]:
+def meshes_of(source: Source, inputs: Inputs, resolution: int) -> dict[str, tuple[ColouredMesh, bool]]:
     """The meshes compared, and whether to show their texture."""
     made = []
     for size in (Config().texture_size, 0):
         asked = Config(resolution=resolution, texture_size=size)
-        config = plan_stage(mesh, asked, {"train": train}, SilentProgress())
+        config = plan_stage(mesh, asked, inputs, SilentProgress())
         made.append(extract_mesh(config, source, SilentProgress()).mesh)
     return {"texture": (made[0], True), "vertex": (made[0], False), "untextured": (made[1], False)}
 
 
-def figures(source: Source, train: Path, given: argparse.Namespace, pictures: Path | None) -> dict[str, Any]:
+def figures(source: Source, inputs: Inputs, given: argparse.Namespace, pictures: Path | None) -> dict[str, Any]:
     """The row of a workspace."""
-    kinds = meshes_of(source, train, given.resolution)
+    kinds = meshes_of(source, inputs, given.resolution)
     found: dict[str, list[tuple[float, float | None]]] = {}
     shares = []
     for view in source.scene.of_split("test"):
@@ -129,7 +129,7 @@ def figures(source: Source, train: Path, given: argparse.Namespace, pictures: Pa
         used &= True if mask is None else mask.numpy()
         images = {kind: image for kind, (image, _) in drawn.items()}
         if given.field:
-            images["field"] = field_render(source, train, photo)
+            images["field"] = field_render(source, inputs["train"], photo)
         shares.append(used.mean())
         for kind, image in images.items():
             found.setdefault(kind, []).append(scores(image, truth, used))
@@ -166,10 +166,10 @@ def main() -> None:
     for path in given.workspaces:
         workspace = Workspace.existing(path)
         keys = workspace.read_run().keys
-        folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train")}
+        folders = {stage: workspace.folder(stage, keys[stage]) for stage in mesh.INPUTS}
         source = load(folders, SilentProgress())
         pictures = None if given.pictures is None else given.pictures / path.stem
-        record.add(set=path.stem, **figures(source, folders["train"], given, pictures))
+        record.add(set=path.stem, **figures(source, folders, given, pictures))
 
 
 if __name__ == "__main__":
