@@ -1,4 +1,4 @@
-"""Nerfstudio's nerfacto on the CPU against our grid field: held-out PSNR by training seconds, and the ratio of times.
+"""Nerfstudio's nerfacto against our grid field: held-out PSNR by training seconds, and the ratio of times.
 
     python -m venv /tmp/nerfstudio && /tmp/nerfstudio/bin/pip install nerfstudio==1.1.5
     python -m benchmarks.nerfacto ../shared/data/fox --workspace /tmp/fox.nerf \
@@ -19,6 +19,12 @@ torch`: 4096 rays a step, its camera optimizer on (SO3xR3), its own data worker,
 own evaluation scores it on its test split, 1024 rays at a time to be sooner done, without LPIPS, whose weights would be
 a download. What counts is the best PSNR that it reached and the seconds it took, and for ours the shortest S from which
 on every run has that PSNR. `--nerfacto-rays` and `--no-camera-optimizer` try what may suit nerfacto better.
+
+`--nerfacto-device cuda --implementation tcnn` runs nerfacto on a GPU; tcnn is tiny-cuda-nn. Its first steps there,
+which load kernels, are not counted. A machine that has nerfstudio alone runs it so, on any folder with a
+transforms.json and its photos:
+
+    python -c "from benchmarks import nerfacto; nerfacto.run_nerfacto(FOLDER, [10, 30, 60], 4096, True, 'cuda', 'tcnn')"
 """
 
 import argparse
@@ -35,6 +41,7 @@ from benchmarks.record import Record, add_out
 
 HERE = Path(__file__).parent
 LINE_SECONDS = 20.0  # of nerfacto's training, between the lines that tell of it
+WARMUP_STEPS = 30  # of nerfacto on a GPU, not counted, as many as benchmarks.gpu_field has
 
 
 class Point(NamedTuple):
@@ -142,10 +149,10 @@ def lacks(python: Path) -> str | None:
 def train_nerfacto(python: Path, *arguments: Any) -> Iterator[Point]:
     """:func:`run_nerfacto` in its own environment; a point at each evaluation. What nerfstudio says goes to a file."""
     log_file = Path(arguments[0]) / "nerfacto.log"
-    command = [python, "-c", f"import nerfacto; nerfacto.run_nerfacto{arguments!r}"]
+    command = [python, "-c", f"from benchmarks import nerfacto; nerfacto.run_nerfacto{arguments!r}"]
     with (
         log_file.open("w") as log,
-        subprocess.Popen(command, cwd=HERE, stdout=subprocess.PIPE, stderr=log, text=True) as process,
+        subprocess.Popen(command, cwd=HERE.parent, stdout=subprocess.PIPE, stderr=log, text=True) as process,
     ):
         for line in process.stdout or ():
             if line.startswith("POINT "):
@@ -156,40 +163,68 @@ def train_nerfacto(python: Path, *arguments: Any) -> Iterator[Point]:
         raise SystemExit(f"nerfacto failed with exit code {process.returncode}; see {log_file}")
 
 
-def run_nerfacto(data: str, due: list[float], rays: int, camera_optimizer: bool) -> None:
+def run_nerfacto(
+    data: str, due: list[float], rays: int, camera_optimizer: bool, device: str = "cpu", implementation: str = "torch"
+) -> None:
     """Inside nerfstudio's environment: its Trainer's loop without viewer and checkpoints, scored at ``due`` seconds."""
     import torch
 
     torch.manual_seed(42)  # as ns-train does
-    trainer = nerfacto_trainer(Path(data), rays, camera_optimizer)
-    location = import_module("nerfstudio.engine.callbacks").TrainingCallbackLocation
-    spent, step, last = 0.0, 0, 0.0
+    trainer = nerfacto_trainer(Path(data), rays, camera_optimizer, device, implementation)
+    where = f"{torch.get_num_threads()} threads" if device == "cpu" else torch.cuda.get_device_name()
+    warmup = 0 if device == "cpu" else WARMUP_STEPS
+    for step in range(warmup):
+        train_step(trainer, step)
+    wait_for(device)
+    spent, step, last = 0.0, warmup, 0.0
     while due:
         started = time.perf_counter()
-        trainer.pipeline.train()
-        for callback in trainer.callbacks:
-            callback.run_callback_at_location(step, location=location.BEFORE_TRAIN_ITERATION)
-        _, _, metrics = trainer.train_iteration(step)
-        for callback in trainer.callbacks:
-            callback.run_callback_at_location(step, location=location.AFTER_TRAIN_ITERATION)
+        metrics = train_step(trainer, step)
+        if spent + time.perf_counter() - started >= due[0]:
+            wait_for(device)
         spent, step = spent + time.perf_counter() - started, step + 1
+        counted = step - warmup
         if spent - last >= LINE_SECONDS:
-            last, speed = spent, f"{step * rays / spent:,.0f} rays/s on {torch.get_num_threads()} threads"
+            last, speed = spent, f"{counted * rays / spent:,.0f} rays/s on {where}"
             print(f"nerfacto {spent:.0f} s, step {step}, batch {metrics['psnr'].item():.2f} dB, {speed}", flush=True)
         if spent >= due[0]:
             scores = trainer.pipeline.get_average_eval_image_metrics(step)
-            print("POINT", json.dumps([spent, scores["psnr"], step, step * rays]), flush=True)
+            wait_for(device)
+            print("POINT", json.dumps([spent, scores["psnr"], counted, counted * rays]), flush=True)
             due = [seconds for seconds in due if seconds > spent]
 
 
-def nerfacto_trainer(data: Path, rays: int, camera_optimizer: bool) -> Any:
-    """Nerfstudio's Trainer of its `nerfacto` configuration, on the CPU, once its data worker has begun to deliver."""
+def wait_for(device: str) -> None:
+    """Until all that a GPU was asked for is computed."""
+    import torch
+
+    if device != "cpu":
+        torch.cuda.synchronize()
+
+
+def train_step(trainer: Any, step: int) -> dict[str, Any]:
+    """A step as in the loop of nerfstudio's Trainer; the metrics of its batch."""
+    location = import_module("nerfstudio.engine.callbacks").TrainingCallbackLocation
+    trainer.pipeline.train()
+    for callback in trainer.callbacks:
+        callback.run_callback_at_location(step, location=location.BEFORE_TRAIN_ITERATION)
+    _, _, metrics = trainer.train_iteration(step)
+    for callback in trainer.callbacks:
+        callback.run_callback_at_location(step, location=location.AFTER_TRAIN_ITERATION)
+    return metrics
+
+
+def nerfacto_trainer(data: Path, rays: int, camera_optimizer: bool, device: str, implementation: str) -> Any:
+    """Nerfstudio's Trainer of its `nerfacto` configuration, once its data worker has begun to deliver."""
+    if implementation == "tcnn":
+        import_module("tinycudann")  # nerfstudio would go on without it, in torch
     lpips = import_module("torchmetrics.image.lpip")
     setattr(lpips, "LearnedPerceptualImagePatchSimilarity", lambda **_: lambda *_: 0.0)  # noqa: B010 for pyright
     config = import_module("nerfstudio.configs.method_configs").method_configs["nerfacto"]
-    config.machine.device_type = "cpu"
-    config.pipeline.model.implementation = "torch"
-    config.pipeline.model.eval_num_rays_per_chunk = 1024  # more spend much of their time on fresh memory
+    config.machine.device_type = device
+    config.pipeline.model.implementation = implementation
+    if device == "cpu":
+        config.pipeline.model.eval_num_rays_per_chunk = 1024  # more spend much of their time on fresh memory
     config.pipeline.datamanager.data = data
     config.pipeline.datamanager.train_num_rays_per_batch = rays
     if not camera_optimizer:
@@ -233,6 +268,8 @@ def main() -> None:
     parser.add_argument("--downscale", type=float, default=2.4, help="photo width / trained width")
     parser.add_argument("--nerfacto-rays", type=int, default=4096, help="in a step")
     parser.add_argument("--camera-optimizer", action=argparse.BooleanOptionalAction, default=True, help="of nerfacto")
+    parser.add_argument("--nerfacto-device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--implementation", choices=("torch", "tcnn"), default="torch", help="of nerfacto")
     add_out(parser)
     given = parser.parse_args()
     record = Record(given.out)
@@ -246,6 +283,7 @@ def main() -> None:
         print(f"\nnerfacto is skipped: {lacking}")
         return
     arguments = (str(folder), sorted(60 * m for m in given.minutes), given.nerfacto_rays, given.camera_optimizer)
+    arguments += (given.nerfacto_device, given.implementation)
     theirs = [recorded(record, "nerfacto", point) for point in train_nerfacto(python, *arguments)]
     ours += [
         recorded(record, "ours, second run", train_ours(workspace, given.downscale, seconds)) for seconds in budgets
