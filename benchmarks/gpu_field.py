@@ -6,7 +6,8 @@
 The first command writes the rays of a workspace; the second needs torch, Warp and Pillow alone, so that a machine
 with a GPU needs nothing else. ``--photos`` is the folder of the workspace's own photos (``output/images``). Training
 starts afresh for each number of seconds, with the sizes a GPU has by default; the first steps, which compile kernels,
-are not counted.
+are not counted. With ``--exchange``, under ``torchrun --nproc-per-node 1 -m``, every step takes the way of several
+GPUs, over NCCL: what that costs beside the way of one.
 """
 
 import argparse
@@ -19,6 +20,7 @@ import numpy as np
 import torch
 from PIL import Image
 from safetensors import safe_open
+from torch.distributed.rendezvous import rendezvous
 
 from benchmarks.record import Record, add_out
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
@@ -26,6 +28,8 @@ from nerf.geometry.rays import Rays
 from nerf.geometry.space_maps import Contraction
 from nerf.kernels import warp
 from nerf.rendering.images import render_image
+from nerf.runtime.ranks import Ranks
+from nerf.training.data_parallel import LeadingTrainer
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from nerf.training.metrics import mean_squared_error, psnr
 from nerf.training.ray_dataset import RayDataset
@@ -73,7 +77,13 @@ def new_trainer(dataset: RayDataset, bounded: bool, target_samples: int) -> Hash
     return HashGridTrainer(field, dataset, how)
 
 
-def train(trainer: HashGridTrainer, seconds: float) -> dict[str, float]:
+def joined() -> Ranks:
+    """The ranks that torchrun has started."""
+    store, rank, size = next(rendezvous("env://"))
+    return Ranks.join(store, rank, size, DEVICE)
+
+
+def train(trainer: HashGridTrainer | LeadingTrainer, seconds: float) -> dict[str, float]:
     """Train for so many seconds; steps, and rays and colours a second."""
     for step in range(WARMUP_STEPS):
         trainer.step(step, 0.0)
@@ -116,7 +126,7 @@ def score(field: HashGridField, dataset: RayDataset) -> dict[str, float]:
     }
 
 
-def profile(trainer: HashGridTrainer, test: RayDataset, step: int) -> None:
+def profile(trainer: HashGridTrainer | LeadingTrainer, test: RayDataset, step: int) -> None:
     """Print the kernels that take most of a step, and of a rendered photo, with the host's share of both."""
     activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
     one_photo = test._replace(first_pixel=test.first_pixel[:2], view_geometry=test.view_geometry[:, :1])
@@ -142,13 +152,17 @@ def run(given: argparse.Namespace) -> None:
     record = Record(given.out)
     datasets, bounded = load(given.file, given.photos)
     torch.set_float32_matmul_precision(given.matmul)
+    ranks = joined() if given.exchange else None
     for seconds in given.seconds:
         trainer = new_trainer(datasets["train"], bounded, given.target_samples)
+        if ranks is not None:
+            trainer = LeadingTrainer(trainer, 0, ranks)
         trained = train(trainer, seconds)
         record.add(
             set=given.file.stem,
             train_seconds=seconds,
             matmul=given.matmul,
+            exchange="" if ranks is None else ranks.backend,
             **score(trainer.model, datasets["test"]),
             **trained,
         )
@@ -163,6 +177,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, nargs="+", default=[10.0])
     parser.add_argument("--target-samples", type=int, default=TARGET_SAMPLES)
     parser.add_argument("--matmul", choices=("highest", "high", "medium"), default="highest")
+    parser.add_argument("--exchange", action="store_true", help="by torchrun's ranks, as several GPUs do")
     parser.add_argument("--profile", action="store_true", help="kernels of a step and of a frame, after the last run")
     add_out(parser)
     run(parser.parse_args())
