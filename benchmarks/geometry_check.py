@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.record import Record, add_out
 from stages.io.photos import Photo, read_photos
 from stages.sfm.colmap.database import (
+    MAPPING_MODEL,
     STRICT_RATIO,
     ExtractionOptions,
     Features,
@@ -30,7 +31,6 @@ from stages.sfm.colmap.database import (
     match_pairs,
     read_vocabulary,
 )
-from stages.sfm.colmap.mappers import MAPPING_MODEL
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import Checked, camera_poses, check_model
 from stages.sfm.pairs.image_retrieval import CELLS

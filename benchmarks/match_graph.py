@@ -19,6 +19,7 @@ import pycolmap
 from benchmarks.record import Record, add_out
 from stages.io.photos import read_photos
 from stages.sfm.colmap.database import (
+    MAPPING_MODEL,
     STRICT_RATIO,
     ExtractionOptions,
     Features,
@@ -30,7 +31,6 @@ from stages.sfm.colmap.database import (
     read_vocabulary,
     verified_matches,
 )
-from stages.sfm.colmap.mappers import MAPPING_MODEL
 from stages.sfm.pairs.feature_matching import match_descriptors
 from stages.sfm.pairs.image_retrieval import CELLS
 from stages.sfm.pairs.match_graph import (

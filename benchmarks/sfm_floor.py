@@ -32,6 +32,7 @@ from stages import ingest
 from stages.hardware.device import processors
 from stages.io.photos import Photo, read_photos
 from stages.sfm.colmap.database import (
+    MAPPING_MODEL,
     STRICT_RATIO,
     ExtractionOptions,
     extract_features,
@@ -39,7 +40,6 @@ from stages.sfm.colmap.database import (
     match_pairs,
     read_descriptors,
 )
-from stages.sfm.colmap.mappers import MAPPING_MODEL
 from stages.sfm.pairs.feature_matching import match_descriptors
 from stages.sfm.pairs.pair_selection import exhaustive
 from stages.sfm.pairs.quality_level import QUALITY_LEVELS

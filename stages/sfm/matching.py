@@ -12,6 +12,7 @@ from stages.contract import Note
 from stages.ingest.masks import write_feature_masks
 from stages.io.amounts import rough_duration
 from stages.sfm.colmap.database import (
+    MAPPING_MODEL,
     RELAXED_RATIO,
     STRICT_RATIO,
     ExtractionOptions,
@@ -24,7 +25,6 @@ from stages.sfm.colmap.database import (
     matched_pairs,
     verified_matches,
 )
-from stages.sfm.colmap.mappers import MAPPING_MODEL
 from stages.sfm.job import JobState
 from stages.sfm.pairs.match_graph import (
     MAX_GROWTH_ROUNDS,

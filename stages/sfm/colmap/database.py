@@ -20,7 +20,6 @@ from stages.hardware import cluster
 from stages.hardware.device import processors
 from stages.hardware.memory import at_once
 from stages.io.photos import Photo, spread
-from stages.sfm.colmap.mappers import MAPPING_MODEL
 from stages.sfm.pairs.feature_matching import IndexedFeatures, index_features, match_descriptors, match_indexed
 from stages.sfm.pairs.image_retrieval import WORDS, Words, photo_similarity, vocabulary
 from stages.sfm.pairs.pair_selection import Pairs, SimilarityMatrix
@@ -31,6 +30,7 @@ FOCAL_GUESS = 1.2  # focal length over the longer side where EXIF is silent: 45 
 STRICT_RATIO = 0.8
 RELAXED_RATIO = 0.9
 BLOCK_SIZE = 32  # pairs of photos that are committed at once (progress, resuming)
+MAPPING_MODEL = "SIMPLE_RADIAL"  # one focal length and one distortion term hold with few matches
 FISHEYE_MODEL = "SIMPLE_RADIAL_FISHEYE"
 FISHEYE_ANGLE_DEG = 150.0
 # Of the maximum: where the median of so many photos has fewer, photos are enlarged (docs/experiments/few_features.md).
@@ -71,12 +71,15 @@ def fill_database(
             if group not in camera_ids:
                 camera_ids[group] = len(camera_ids) + 1
                 _enter_camera(db, _first_guess(photo, camera_model, camera_params, camera_ids[group]))
-            camera_id = camera_ids[group]
-            image = pycolmap.Image(name=photo.image_name, camera_id=camera_id, image_id=image_id)
-            db.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
-            frame.add_data_id(image.data_id)
-            db.write_frame(frame, use_frame_id=True)
+            _enter_image(db, photo.image_name, camera_ids[group], image_id)
+
+
+def _enter_image(db: pycolmap.Database, name: str, camera_id: int, image_id: int) -> None:
+    image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
+    db.write_image(image, use_image_id=True)
+    frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
+    frame.add_data_id(image.data_id)
+    db.write_frame(frame, use_frame_id=True)
 
 
 def _first_guess(photo: Photo, model: str, params: Sequence[float] | None, camera_id: int) -> pycolmap.Camera:
@@ -416,6 +419,22 @@ def adopt_cameras(database: Path, model: pycolmap.Reconstruction, image_ids: Ite
             camera.has_prior_focal_length = True
             db.update_camera(camera)
     return camera_ids
+
+
+def copy_with_cameras_of(model: pycolmap.Reconstruction, database: Path, copy: Path) -> None:
+    """Copy keypoints and verified matches to a database whose images, numbered as in the model, have its cameras."""
+    with (
+        pycolmap.Database.open(database) as db,
+        pycolmap.Database.open(copy) as new,
+        pycolmap.DatabaseTransaction(new),
+    ):
+        for camera in model.cameras.values():
+            _enter_camera(new, camera)
+        for image_id, image in sorted(model.images.items()):
+            _enter_image(new, image.name, image.camera_id, image_id)
+            new.write_keypoints(image_id, db.read_keypoints(image_id))
+        for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
+            new.write_two_view_geometry(*pycolmap.pair_id_to_image_pair(pair_id), geometry)
 
 
 def copy_without_pairs(database: Path, copy: Path, pairs: Iterable[Sequence[int]]) -> None:

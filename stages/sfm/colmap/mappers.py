@@ -1,5 +1,6 @@
-"""From matches to sub-models: incremental and global mapping. Call it in a worker process."""
+"""From matches to sub-models: incremental and global mapping, points at known poses. Call it in a worker process."""
 
+import shutil
 from collections.abc import Callable, Collection
 from pathlib import Path
 
@@ -8,9 +9,10 @@ import pycolmap
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from stages.sfm.colmap.database import copy_with_cameras_of
+from stages.sfm.colmap.models import load_native, write_native
 from stages.sfm.retry_strategies import MIN_POSE_INLIERS, MappingOptions
 
-MAPPING_MODEL = "SIMPLE_RADIAL"  # one focal length and one distortion term hold with few matches
 MIN_MODEL_IMAGES = 3
 # COLMAP's own are 1.1 and 5, for all observations; the final bundle adjustment comes after mapping in any case.
 BA_GLOBAL_RATIO, BA_GLOBAL_MAX_REFINEMENTS = 1.3, 2
@@ -93,6 +95,25 @@ def map_globally(
     for model in found.values():
         _keep_largest_group(model)
     return sorted(found.values(), key=_rank, reverse=True)
+
+
+def triangulate(sparse: Path, database: Path, images: Path, target: Path, without: Collection[int]) -> int:
+    """Write to the folder ``target`` the model in ``sparse``, whose images have the database's numbers, with the points
+    that verified matches tell at its poses, which stay, as its cameras do. Images ``without`` points tell none and are
+    left out. The number of points; nothing is written where there are none.
+    """
+    model, scratch = load_native(sparse), target.with_name(f"{target.name}-unfinished")
+    scratch.mkdir(parents=True, exist_ok=True)
+    copy_with_cameras_of(model, database, scratch / "database.db")
+    for image_id in without:
+        model.deregister_frame(model.image(image_id).frame_id)
+    if model.num_reg_images() > 1:
+        options = pipeline_options(0)
+        model = pycolmap.triangulate_points(model, scratch / "database.db", images, scratch, options=options)
+    if model.num_points3D():
+        write_native(target, model)
+    shutil.rmtree(scratch)
+    return model.num_points3D()
 
 
 def _keep_largest_group(model: pycolmap.Reconstruction) -> None:

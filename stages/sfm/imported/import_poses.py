@@ -1,6 +1,8 @@
 """Imported poses: read, written as a model, checked against what the photos show."""
 
+import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from stages.io.photos import Photo, read_frame_names
 from stages.io.sparse_model import SparseModel
 from stages.sfm.colmap.cameras import focal_lengths_and_centre
 from stages.sfm.colmap.models import read_model, write_model
-from stages.sfm.imported.check_worker import check_imported_poses
+from stages.sfm.imported.check_worker import POINTS, check_imported_poses
 from stages.sfm.imported.conventions import (
     AXES,
     Fit,
@@ -37,7 +39,7 @@ def import_poses(
     Raises StageError where they cannot be used, and where their photos show that they are of another convention.
     """
     known, errors = write_imported_model(cameras, convention, photos, ingest, folder, progress)
-    check = _check(known.model, photos, ingest, folder, (cameras / "images.txt").is_file(), progress)
+    check = _check(known, photos, ingest, folder, (cameras / "images.txt").is_file(), progress)
     if check and (fit := check.pop("fit")):
         read_as = convention.with_defaults(convention_of_format(cameras))
         names = _names(known.model, photos)
@@ -46,6 +48,8 @@ def import_poses(
         raise _other_focal_lengths(cameras.name, check["error_px"], FocalFit(**longer), known.model)
     if check:
         _note_doubts(cameras.name, check, known.model, photos, progress)
+        if check.pop("triangulated"):
+            known, errors = _with_triangulated_points(known, folder)
     judged = check.pop("images", {}) if check else {}
     unknown = {"agreement": None, "transfer_px": None}
     return {
@@ -134,17 +138,28 @@ def _how_to_convert(fit: Fit, direction: str, axes: Float[np.ndarray, "3 3"], re
 
 
 def _check(
-    model: SparseModel, photos: Sequence[Photo], ingest: Path, folder: Path, of_quaternions: bool, progress: Progress
+    known: ImportedPoses, photos: Sequence[Photo], ingest: Path, folder: Path, of_quaternions: bool, progress: Progress
 ) -> dict[str, Any] | None:
     """What verified matches of neighbouring photos say of imported poses; None, with a note, where they say nothing."""
     progress.update("comparing the imported poses with matches of neighbouring photos")
-    posed = {image.file for image in model.images}
+    posed = {image.file for image in known.model.images}
     posed_photos = [photo for photo in photos if photo.image_name in posed]
-    check = check_imported_poses(posed_photos, ingest / "images", folder, of_quaternions)
+    check = check_imported_poses(posed_photos, ingest / "images", folder, known.test_files or (), of_quaternions)
     if why := check.get("failed"):
         progress.note("sfm.poses-unchecked", f"the imported poses were not checked: {why}")
         return None
     return check
+
+
+def _with_triangulated_points(known: ImportedPoses, folder: Path) -> tuple[ImportedPoses, Float[np.ndarray, "points"]]:
+    """The poses with the points that the check found, in ``sparse/`` too; and the points' reprojection errors."""
+    found, of_file = read_model(folder / POINTS), {image.file: i for i, image in enumerate(known.model.images)}
+    view = np.array([of_file[image.file] for image in found.images])[found.view]  # both are in order of file
+    points = {name: getattr(found, name) for name in ("xyz", "rgb", "error_px", "point", "xy")}
+    known = replace(known, model=replace(known.model, view=view, **points))
+    write_model(folder / "sparse", known.model)
+    shutil.rmtree(folder / POINTS)
+    return known, found.error_px
 
 
 def _names(model: SparseModel, photos: Sequence[Photo]) -> list[str]:

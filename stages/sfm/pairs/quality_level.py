@@ -20,6 +20,7 @@ from stages.hardware.device import processors
 from stages.io.amounts import rough_duration
 from stages.io.photos import Photo, spread
 from stages.sfm.colmap.database import (
+    MAPPING_MODEL,
     STRICT_RATIO,
     ExtractionOptions,
     Features,
@@ -28,7 +29,6 @@ from stages.sfm.colmap.database import (
     match_pairs,
     read_vocabulary,
 )
-from stages.sfm.colmap.mappers import MAPPING_MODEL
 from stages.sfm.pairs import Matcher
 from stages.sfm.pairs.image_retrieval import CELLS
 from stages.sfm.pairs.pair_selection import CapturePriors, capture_priors, choose, exhaustive, expected_pairs
