@@ -153,7 +153,9 @@ def _figures(registration: Mapping[str, Any]) -> str | None:
     said = []
     if check and check["pairs"]:
         pairs = f"{check['agreeing']:,} of {check['pairs']:,} verified image pairs"
-        said.append(f"the cameras agree with {pairs} (median error {check['error_px']:.2f} px)")
+        before = check.get("adjusted_from_px")  # of imported poses
+        adjusted = "" if before is None else f"; {before:.1f} px before the given poses were adjusted"
+        said.append(f"the cameras agree with {pairs} (median error {check['error_px']:.2f} px{adjusted})")
     if _differs(comparison) and _is_refuted(comparison):
         name = "incremental" if comparison["taken"] else "global"
         support = f"{comparison['agreeing_other']:,} of their image pairs agree with it and {comparison['agreeing']:,}"

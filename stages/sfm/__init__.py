@@ -57,6 +57,10 @@ class Config(StageConfig):
             "(default: opengl in transforms files, opencv in COLMAP models)."
         ),
     )
+    adjust_poses: bool = Field(
+        default=True,
+        description="Adjust imported poses without points to the matches of their photos, where these contradict them.",
+    )
     seed: int = Field(
         default=0,
         ge=0,

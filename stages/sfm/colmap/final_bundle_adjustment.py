@@ -1,17 +1,23 @@
-"""The final adjustment of cameras and points. Call it in a child process."""
+"""The final adjustment of cameras and points, and of imported poses. Call it in a child process."""
 
 from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pycolmap
+from jaxtyping import Float
 
+from nerf.geometry.alignment import align
 from stages.contract import Note
 from stages.sfm.colmap.camera_model_selection import CameraModels, adjustment_options, choose
 from stages.sfm.colmap.camera_models import MODELS, degenerate_cameras, set_camera_models
-from stages.sfm.colmap.mappers import pipeline_options
+from stages.sfm.colmap.database import copy_with_cameras_of
+from stages.sfm.colmap.mappers import pipeline_options, triangulated
+from stages.sfm.colmap.models import load_native, write_native
 from stages.sfm.colmap.observations import noise_px, observations
 from stages.sfm.colmap.uncertainty import pose_uncertainty_px
 
@@ -19,6 +25,9 @@ from stages.sfm.colmap.uncertainty import pose_uncertainty_px
 # tenth more, mostly at the borders of wide photos, these tell the models apart.
 MIN_GROWTH_TO_CHOOSE_AGAIN = 1.1
 SIMPLEST = MODELS[0]
+# Of imported poses: observations this many times the median error off count in the first pass, in the second those
+# that mapping takes.
+MAX_ERROR_MULTIPLE, MAX_ERROR_PX = 5.0, 4.0
 CLOSING_STEPS = (3, 3)  # of the adjustment of all observations, before and after those that fit no more are dropped
 
 
@@ -158,6 +167,37 @@ def _adjust_thinned(
     mapper.filter_points(options.mapper)
     mapper.end_reconstruction(discard=False)
     model.update_point_3d_errors()
+
+
+def adjust_poses(sparse: Path, database: Path, images: Path, target: Path, error_px: float) -> None:
+    """Write to the folder ``target`` the model in ``sparse``, whose images have the database's numbers, with its poses
+    adjusted to the verified matches; ``error_px`` is how far half of these lie from where the poses predict them.
+    Cameras stay, and so does the frame: a similarity lays the new camera centres on the old ones. No points are
+    written.
+    """
+    model, options = load_native(sparse), pipeline_options(0)
+    options.extract_colors = False
+    before = _centres(model)
+    with TemporaryDirectory(dir=target.parent) as scratch:
+        own = Path(scratch, "database.db")
+        copy_with_cameras_of(model, database, own)
+        for limit_px in (max(MAX_ERROR_MULTIPLE * error_px, MAX_ERROR_PX), MAX_ERROR_PX):
+            options.mapper.filter_max_reproj_error = limit_px
+            options.triangulation.complete_max_reproj_error = limit_px
+            options.triangulation.merge_max_reproj_error = limit_px
+            model = triangulated(model, own, images, options)
+            noise = noise_px(model, observations(model))
+            bundle_adjust(model, set(model.cameras), adjustment_options(False, noise))
+    with suppress(ValueError):  # centres on a line: two cameras of the adjustment keep the frame
+        back = align(_centres(model), before)
+        model.transform(pycolmap.Sim3d(back.scale, pycolmap.Rotation3d(back.rotation), back.translation))
+    for point in list(model.point3D_ids()):
+        model.delete_point3D(point)
+    write_native(target, model)
+
+
+def _centres(model: pycolmap.Reconstruction) -> Float[np.ndarray, "images 3"]:
+    return np.array([model.image(i).projection_center() for i in sorted(model.reg_image_ids())])
 
 
 def release_focal_lengths(model: pycolmap.Reconstruction, constant_cameras: Collection[int] = ()) -> None:

@@ -1,8 +1,8 @@
 """From matches to sub-models: incremental and global mapping, points at known poses. Call it in a worker process."""
 
-import shutil
 from collections.abc import Callable, Collection
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pycolmap
@@ -102,18 +102,24 @@ def triangulate(sparse: Path, database: Path, images: Path, target: Path, withou
     that verified matches tell at its poses, which stay, as its cameras do. Images ``without`` points tell none and are
     left out. The number of points; nothing is written where there are none.
     """
-    model, scratch = load_native(sparse), target.with_name(f"{target.name}-unfinished")
-    scratch.mkdir(parents=True, exist_ok=True)
-    copy_with_cameras_of(model, database, scratch / "database.db")
+    model = load_native(sparse)
     for image_id in without:
         model.deregister_frame(model.image(image_id).frame_id)
-    if model.num_reg_images() > 1:
-        options = pipeline_options(0)
-        model = pycolmap.triangulate_points(model, scratch / "database.db", images, scratch, options=options)
+    with TemporaryDirectory(dir=target.parent) as scratch:
+        copy_with_cameras_of(model, database, Path(scratch, "database.db"))
+        if model.num_reg_images() > 1:
+            model = triangulated(model, Path(scratch, "database.db"), images, pipeline_options(0))
     if model.num_points3D():
         write_native(target, model)
-    shutil.rmtree(scratch)
     return model.num_points3D()
+
+
+def triangulated(
+    model: pycolmap.Reconstruction, database: Path, images: Path, options: pycolmap.IncrementalPipelineOptions
+) -> pycolmap.Reconstruction:
+    """The model with points at its poses by the verified matches of a database that has its cameras."""
+    with TemporaryDirectory(dir=database.parent) as scratch:
+        return pycolmap.triangulate_points(model, database, images, scratch, options=options)
 
 
 def _keep_largest_group(model: pycolmap.Reconstruction) -> None:

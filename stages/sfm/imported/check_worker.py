@@ -2,7 +2,7 @@
 abort.
 
 Features of reduced photos are matched between neighbours by pose, which the check of stages/sfm/pose_check.py
-judges. Poses that fit and came without points get those of the matches. ``python -P -m
+judges. Poses without points are adjusted to the matches where they are inexact, and get points. ``python -P -m
 stages.sfm.imported.check_worker`` reads a job from stdin as one line of JSON and answers with another.
 """
 
@@ -30,6 +30,7 @@ from stages.sfm.colmap.database import (
     match_pairs,
     verified_matches,
 )
+from stages.sfm.colmap.final_bundle_adjustment import adjust_poses
 from stages.sfm.colmap.mappers import triangulate
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import camera_poses, check_model, facts
@@ -43,23 +44,32 @@ COMMAND = ["-P", "-m", "stages.sfm.imported.check_worker"]
 MAX_IMAGE_SIZE, MAX_FEATURES = 1000, 2000  # enough to tell a step of a few pixels, in seconds for hundreds of photos
 PARTNERS = 6  # of each photo
 MAX_NAME_STEPS = 2  # positions before and after it, in the order of names
-POINTS = "points"  # the folder of a model with the points that the matches tell
+ADJUSTED, POINTS = "adjusted", "points"  # folders of models: with adjusted poses, with points
 TURN_DEG = 30.0  # two photos whose axes differ by so much count as far apart as two whose centres are usual neighbours
 
 
 def check_imported_poses(
-    photos: Sequence[Photo], images: Path, folder: Path, test_files: Sequence[str] = (), of_quaternions: bool = False
+    photos: Sequence[Photo],
+    images: Path,
+    folder: Path,
+    test_files: Sequence[str] = (),
+    of_quaternions: bool = False,
+    adjust: bool = True,
 ) -> dict[str, Any]:
     """Check the model in ``folder/sparse``, whose images are these photos in order of ``file``. ``of_quaternions``: its
     poses stood as quaternions in a text file, which somebody may have written in another order.
 
     Returns what :func:`stages.sfm.colmap.repair.facts` says, with the ``fit`` of another convention where the poses
     contradict their photos and it does not, and the ``focal_fit`` of other focal lengths; or {"failed": why} where
-    nothing could be compared. The model stays as it is. Where it has no points and its poses fit, ``folder/points``
-    is a model with the points that the matches tell, without those of ``test_files``: ``triangulated`` many.
+    nothing could be compared. The model stays as it is. Where it has no points,
+
+    * inexact poses are adjusted to the matches, if ``adjust``. Where they fit then, ``folder/adjusted`` is a model
+      of all photos with these poses, and ``adjusted_from_px`` the error before; else that is None;
+    * poses that fit get points: ``folder/points`` is a model with the points that the matches tell, without those of
+      ``test_files``: ``triangulated`` many.
     """
     job = {"photos": [asdict(photo) for photo in photos], "images": str(images.absolute()), "folder": str(folder)}
-    job |= {"test_files": list(test_files), "of_quaternions": of_quaternions}
+    job |= {"test_files": list(test_files), "of_quaternions": of_quaternions, "adjust": adjust}
     with (folder / "sfm.log").open("ab") as log:
         answer = subprocess.run(
             [sys.executable, *COMMAND],
@@ -85,46 +95,80 @@ def main() -> None:
 
 
 def check(
-    photos: list[dict[str, Any]], images: str, folder: str, test_files: list[str], of_quaternions: bool
+    photos: list[dict[str, Any]],
+    images: str,
+    folder: str,
+    test_files: list[str],
+    of_quaternions: bool,
+    adjust: bool,
 ) -> dict[str, Any]:
-    """Match neighbours by pose and by name, and let their matches judge the poses."""
-    some, scratch = [Photo(**photo) for photo in photos], Path(folder, "check")
+    """Match neighbours by pose and by name, and let their matches judge the poses, then adjust and complete them."""
+    some, root, scratch = [Photo(**photo) for photo in photos], Path(folder), Path(folder, "check")
     scratch.mkdir(exist_ok=True)
-    database, masks = scratch / "check.db", scratch / "masks"
-    model = load_native(Path(folder, "sparse"))
-    fill_database(database, some, MAPPING_MODEL)
-    extraction = ExtractionOptions(MAX_IMAGE_SIZE, MAX_FEATURES, doubled_up_to=MAX_IMAGE_SIZE // 2)
-    if write_feature_masks(Path(images).parent, some, masks):
-        extraction = extraction._replace(masks=masks)
-    extract_features(database, Path(images), some, extraction)
-    poses = camera_poses(model)
-    by_name = natural_order([photo.name for photo in some])  # where poses are wrong, so are their neighbours
-    pairs = union(neighbours_by_pose(poses), pairs_apart(by_name, 1, MAX_NAME_STEPS))
-    match_pairs(database, pairs, 0, STRICT_RATIO)
-    verified = int((verified_matches(database, pairs) >= MIN_INLIERS).sum())
-    checked = check_model(model, database, 0) if verified >= MIN_PAIRS else None
-    if checked is None:
+    sparse, database = root / "sparse", scratch / "check.db"
+    verified = _match(some, Path(images), camera_poses(load_native(sparse)), database)
+    if verified < MIN_PAIRS:
         shutil.rmtree(scratch)
         return {"failed": f"only {verified} pairs of neighbouring photos have enough matches"}
+    found, failed = _judge(sparse, database, of_quaternions)
+    adjusted, points = None, 0
+    if not (found["fit"] or found["focal_fit"] or load_native(sparse).num_points3D()):
+        if adjust and not _fit_well(found) and (better := _adjust(sparse, database, Path(images), root, found)):
+            (found, failed), adjusted, sparse = better, found["error_px"], root / ADJUSTED
+        # Photos with alpha need no points to tell the region, and edges of what is cut out are no points of a surface.
+        if _mostly_agree(found) and 2 * sum(photo.has_alpha for photo in some) <= len(some):
+            # Official test photos are to be as unknown as any new view.
+            tests = [number for number, photo in enumerate(some, 1) if photo.image_name in test_files]
+            points = triangulate(sparse, database, Path(images), root / POINTS, {*failed, *tests})
+    shutil.rmtree(scratch)
+    return found | {"adjusted_from_px": adjusted, "triangulated": points}
+
+
+def _match(photos: list[Photo], images: Path, poses: Float[np.ndarray, "photos 3 4"], database: Path) -> int:
+    """Match the photos' neighbours; how many pairs have enough verified matches."""
+    masks = database.with_name("masks")
+    fill_database(database, photos, MAPPING_MODEL)
+    extraction = ExtractionOptions(MAX_IMAGE_SIZE, MAX_FEATURES, doubled_up_to=MAX_IMAGE_SIZE // 2)
+    if write_feature_masks(images.parent, photos, masks):
+        extraction = extraction._replace(masks=masks)
+    extract_features(database, images, photos, extraction)
+    by_name = natural_order([photo.name for photo in photos])  # where poses are wrong, so are their neighbours
+    pairs = union(neighbours_by_pose(poses), pairs_apart(by_name, 1, MAX_NAME_STEPS))
+    match_pairs(database, pairs, 0, STRICT_RATIO)
+    return int((verified_matches(database, pairs) >= MIN_INLIERS).sum())
+
+
+def _judge(sparse: Path, database: Path, of_quaternions: bool) -> tuple[dict[str, Any], list[int]]:
+    """What the matches say of the poses, and the photos (numbered from 1) that fail the check."""
+    model = load_native(sparse)
+    checked, poses = check_model(model, database, 0), camera_poses(model)
     found = facts(model, checked)
-    contradicted = 2 * found["agreeing"] < found["pairs"]
-    fit = best_fit(checked.matches, poses, of_quaternions) if contradicted else None
+    fit = None if _mostly_agree(found) else best_fit(checked.matches, poses, of_quaternions)
     if fit is None and found["agreeing"] < found["pairs"]:
         fit = fit_of_some(checked.matches, poses, checked.check.agrees)
     longer = None if fit or checked.fits else fitting_focal_factor(checked.matches, poses)
-    points, transparent = 0, sum(photo.has_alpha for photo in some)
-    # Photos with alpha need no points to tell the region, and edges of what is cut out are no points of a surface.
-    if not (contradicted or fit or longer or model.num_points3D()) and 2 * transparent <= len(some):
-        # Official test photos are to be as unknown as any new view.
-        tests = [number for number, photo in enumerate(some, 1) if photo.image_name in test_files]
-        without = {*checked.failed(), *tests}
-        points = triangulate(Path(folder, "sparse"), database, Path(images), Path(folder, POINTS), without)
-    shutil.rmtree(scratch)
-    return found | {
-        "fit": fit._asdict() if fit else None,
-        "focal_fit": longer._asdict() if longer else None,
-        "triangulated": points,
-    }
+    found |= {"fit": fit._asdict() if fit else None, "focal_fit": longer._asdict() if longer else None}
+    return found, checked.failed()
+
+
+def _adjust(
+    sparse: Path, database: Path, images: Path, root: Path, found: dict[str, Any]
+) -> tuple[dict[str, Any], list[int]] | None:
+    """Adjust the poses, and judge again; None where they do not fit well then."""
+    adjust_poses(sparse, database, images, root / ADJUSTED, found["error_px"])
+    again = _judge(root / ADJUSTED, database, of_quaternions=False)
+    if _fit_well(again[0]) and again[0]["error_px"] < found["error_px"]:
+        return again
+    shutil.rmtree(root / ADJUSTED)
+    return None
+
+
+def _mostly_agree(found: dict[str, Any]) -> bool:
+    return 2 * found["agreeing"] >= found["pairs"]
+
+
+def _fit_well(found: dict[str, Any]) -> bool:
+    return found["fits"] and _mostly_agree(found)
 
 
 def neighbours_by_pose(world_from_camera: Float[np.ndarray, "photos 3 4"]) -> Pairs:

@@ -14,7 +14,7 @@ from stages.io.photos import Photo, read_frame_names
 from stages.io.sparse_model import SparseModel
 from stages.sfm.colmap.cameras import focal_lengths_and_centre
 from stages.sfm.colmap.models import read_model, write_model
-from stages.sfm.imported.check_worker import POINTS, check_imported_poses
+from stages.sfm.imported.check_worker import ADJUSTED, POINTS, check_imported_poses
 from stages.sfm.imported.conventions import (
     AXES,
     Fit,
@@ -32,14 +32,21 @@ MAX_NAMES = 5
 
 
 def import_poses(
-    cameras: Path, convention: PoseConvention, photos: Sequence[Photo], ingest: Path, folder: Path, progress: Progress
+    cameras: Path,
+    convention: PoseConvention,
+    photos: Sequence[Photo],
+    ingest: Path,
+    folder: Path,
+    adjust: bool,
+    progress: Progress,
 ) -> dict[str, Any]:
-    """Write ``sparse/`` from imported poses, and check them against the photos: what registration.json says of them.
+    """Write ``sparse/`` from imported poses, and check them against the photos, which may ``adjust`` them where they
+    are inexact: what registration.json says of them.
 
     Raises StageError where they cannot be used, and where their photos show that they are of another convention.
     """
     known, errors = write_imported_model(cameras, convention, photos, ingest, folder, progress)
-    check = _check(known, photos, ingest, folder, (cameras / "images.txt").is_file(), progress)
+    check = _check(known, photos, ingest, folder, (cameras / "images.txt").is_file(), adjust, progress)
     if check and (fit := check.pop("fit")):
         read_as = convention.with_defaults(convention_of_format(cameras))
         names = _names(known.model, photos)
@@ -48,8 +55,7 @@ def import_poses(
         raise _other_focal_lengths(cameras.name, check["error_px"], FocalFit(**longer), known.model)
     if check:
         _note_doubts(cameras.name, check, known.model, photos, progress)
-        if check.pop("triangulated"):
-            known, errors = _with_triangulated_points(known, folder)
+        known, errors = _improved(known, errors, check, folder, progress)
     judged = check.pop("images", {}) if check else {}
     unknown = {"agreement": None, "transfer_px": None}
     return {
@@ -138,28 +144,63 @@ def _how_to_convert(fit: Fit, direction: str, axes: Float[np.ndarray, "3 3"], re
 
 
 def _check(
-    known: ImportedPoses, photos: Sequence[Photo], ingest: Path, folder: Path, of_quaternions: bool, progress: Progress
+    known: ImportedPoses,
+    photos: Sequence[Photo],
+    ingest: Path,
+    folder: Path,
+    of_quaternions: bool,
+    adjust: bool,
+    progress: Progress,
 ) -> dict[str, Any] | None:
     """What verified matches of neighbouring photos say of imported poses; None, with a note, where they say nothing."""
     progress.update("comparing the imported poses with matches of neighbouring photos")
     posed = {image.file for image in known.model.images}
     posed_photos = [photo for photo in photos if photo.image_name in posed]
-    check = check_imported_poses(posed_photos, ingest / "images", folder, known.test_files or (), of_quaternions)
+    check = check_imported_poses(
+        posed_photos, ingest / "images", folder, known.test_files or (), of_quaternions, adjust
+    )
     if why := check.get("failed"):
         progress.note("sfm.poses-unchecked", f"the imported poses were not checked: {why}")
         return None
     return check
 
 
-def _with_triangulated_points(known: ImportedPoses, folder: Path) -> tuple[ImportedPoses, Float[np.ndarray, "points"]]:
-    """The poses with the points that the check found, in ``sparse/`` too; and the points' reprojection errors."""
-    found, of_file = read_model(folder / POINTS), {image.file: i for i, image in enumerate(known.model.images)}
-    view = np.array([of_file[image.file] for image in found.images])[found.view]  # both are in order of file
-    points = {name: getattr(found, name) for name in ("xyz", "rgb", "error_px", "point", "xy")}
-    known = replace(known, model=replace(known.model, view=view, **points))
-    write_model(folder / "sparse", known.model)
-    shutil.rmtree(folder / POINTS)
-    return known, found.error_px
+def _improved(
+    known: ImportedPoses, errors: Float[np.ndarray, "points"], check: dict[str, Any], folder: Path, progress: Progress
+) -> tuple[ImportedPoses, Float[np.ndarray, "points"]]:
+    """The poses as the check has adjusted them, with the points that it has found, in ``sparse/`` too; and the points'
+    reprojection errors."""
+    model = known.model
+    if check["adjusted_from_px"] is not None:
+        adjusted = read_model(folder / ADJUSTED)
+        moved, turned = _median_changes(model, adjusted)
+        progress.note(
+            "sfm.poses-adjusted",
+            "the imported poses were inexact and are adjusted to their photos: the error of the matches was "
+            f"{check['adjusted_from_px']:.1f} px and is {check['error_px']:.1f} px. Cameras moved by {moved:.2g}% of "
+            f"their extent and turned by {turned:.2g}° (median). --sfm.no-adjust-poses keeps them as they are",
+        )
+        model = replace(model, images=adjusted.images)
+    if check.pop("triangulated"):
+        found, of_file = read_model(folder / POINTS), {image.file: i for i, image in enumerate(model.images)}
+        view = np.array([of_file[image.file] for image in found.images])[found.view]  # both are in order of file
+        points = {name: getattr(found, name) for name in ("xyz", "rgb", "error_px", "point", "xy")}
+        model, errors = replace(model, view=view, **points), found.error_px
+    if model is not known.model:
+        write_model(folder / "sparse", model)
+    for scratch in (ADJUSTED, POINTS):
+        shutil.rmtree(folder / scratch, ignore_errors=True)
+    return replace(known, model=model), errors
+
+
+def _median_changes(given: SparseModel, adjusted: SparseModel) -> tuple[float, float]:
+    """By how much the poses of a model differ from another's: in percent of the extent of its cameras, and degrees."""
+    before, after = (np.array([image.sfm_from_camera for image in model.images]) for model in (given, adjusted))
+    extent = np.linalg.norm(np.ptp(before[:, :, 3], axis=0))
+    moved = np.median(np.linalg.norm(after[:, :, 3] - before[:, :, 3], axis=1)) / extent
+    trace = np.einsum("nij,nij->n", before[:, :, :3], after[:, :, :3])  # of the rotation between them
+    turned = np.median(np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1))))
+    return 100 * float(moved), float(turned)
 
 
 def _names(model: SparseModel, photos: Sequence[Photo]) -> list[str]:
