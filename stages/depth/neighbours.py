@@ -49,7 +49,7 @@ class Tracks(NamedTuple):
 
 def tracks_of(scene: Scene, views: Sequence[int], points: Mapping[str, np.ndarray]) -> Tracks:
     """What the ``views`` (indices into the scene's) see of the sparse points; of a grid of points in the region of
-    interest where there are no tracks, as with imported cameras."""
+    interest where there are no tracks, as with imported poses of photos with alpha."""
     number = np.full(len(scene.views), -1)
     number[list(views)] = np.arange(len(views))
     view = number[points["view"]]

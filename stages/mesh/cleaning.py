@@ -95,9 +95,9 @@ def _hidden(surface: Surface, visible: np.ndarray, points: np.ndarray, has_alpha
     """Faces without a vertex within DILATION_STEPS edges of a ``visible`` one or near a sparse point, (faces,) bool;
     none where that would be all.
 
-    Where there are too few points to tell (imported cameras have none), visibility alone decides; but of photos with
-    alpha only such parts go as end openly. Their silhouettes bound an object on all sides, so that its bare underside
-    closes it and stays. Without alpha the volume below a table is as the field happened to leave it.
+    Where there are too few points to tell (imported poses of photos with alpha have none), visibility alone decides;
+    but of photos with alpha only such parts go as end openly. Their silhouettes bound an object on all sides, so that
+    its bare underside closes it and stays. Without alpha the volume below a table is as the field happened to leave it.
     """
     for _ in range(DILATION_STEPS):
         visible = _dilated(surface.faces, visible)

@@ -91,9 +91,10 @@ def _doubts_of_check(registration: Mapping[str, Any]) -> list[str]:
 
 
 def _weak_links(registration: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Groups that few matches link to the rest; none of imported poses, which do not rest on matches."""
-    check = registration.get("check")
-    return check["weak_links"] if check and registration["source"] != "import" else []
+    """Groups that few matches link to the rest; none of imported poses that do not rest on matches."""
+    check = registration.get("check") or {}
+    rest_on_matches = registration["source"] != "import" or check.get("adjusted_from_px") is not None
+    return check.get("weak_links", []) if rest_on_matches else []
 
 
 def _sequence_breaks(registration: Mapping[str, Any]) -> list[tuple[str, str]]:

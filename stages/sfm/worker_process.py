@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 PHASES = {"features": (0.0, 0.35), "matching": (0.35, 0.5), "mapping": (0.85, 0.15)}
 FIRST_STRATEGY, REFINING = 0.7, 0.95  # where they end and begin in the whole
 MIN_FREE_BYTES = 1 << 22  # less than the smallest of COLMAP's files that may have found no room
-OF_IMPORTED_POSES = {"cameras", "camera_axes", "pose_direction", "adjust_poses"}  # no options of the worker's
+OF_IMPORTED_POSES = {"cameras", "camera_axes", "pose_direction", "adjust_poses"}  # not passed to the worker
 COMMAND = ["-P", "-m", "stages.sfm.worker"]  # -P: nothing that lies in the current folder is taken for a module
 
 

@@ -1,23 +1,19 @@
 """The final adjustment of cameras and points, and of imported poses. Call it in a child process."""
 
 from collections.abc import Collection
-from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float
 
-from nerf.geometry.alignment import align
+from nerf.geometry.alignment import align_poses
 from stages.contract import Note
 from stages.sfm.colmap.camera_model_selection import CameraModels, adjustment_options, choose
 from stages.sfm.colmap.camera_models import MODELS, degenerate_cameras, set_camera_models
-from stages.sfm.colmap.database import copy_with_cameras_of
 from stages.sfm.colmap.mappers import pipeline_options, triangulated
-from stages.sfm.colmap.models import load_native, write_native
+from stages.sfm.colmap.models import load_native, read_model, write_model, write_native
 from stages.sfm.colmap.observations import noise_px, observations
 from stages.sfm.colmap.uncertainty import pose_uncertainty_px
 
@@ -25,9 +21,8 @@ from stages.sfm.colmap.uncertainty import pose_uncertainty_px
 # tenth more, mostly at the borders of wide photos, these tell the models apart.
 MIN_GROWTH_TO_CHOOSE_AGAIN = 1.1
 SIMPLEST = MODELS[0]
-# Of imported poses: observations this many times the median error off count in the first pass, in the second those
-# that mapping takes.
-MAX_ERROR_MULTIPLE, MAX_ERROR_PX = 5.0, 4.0
+MAX_ERROR_MULTIPLE = 5.0  # of the median error of imported poses: observations that are farther off do not count
+PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # what OPENCV has more parameters than
 CLOSING_STEPS = (3, 3)  # of the adjustment of all observations, before and after those that fit no more are dropped
 
 
@@ -169,35 +164,58 @@ def _adjust_thinned(
     model.update_point_3d_errors()
 
 
-def adjust_poses(sparse: Path, database: Path, images: Path, target: Path, error_px: float) -> None:
-    """Write to the folder ``target`` the model in ``sparse``, whose images have the database's numbers, with its poses
-    adjusted to the verified matches; ``error_px`` is how far half of these lie from where the poses predict them.
-    Cameras stay, and so does the frame: a similarity lays the new camera centres on the old ones. No points are
-    written.
+def adjust_poses(sparse: Path, database: Path, images: Path, target: Path, error_px: float, limit_px: float) -> bool:
+    """Write to the folder ``target`` the model in ``sparse``, with the database's image ids, its poses adjusted to the
+    verified matches; ``error_px``: their median error at the given poses, ``limit_px``: that of an observation at most,
+    in the end. Cameras stay, and so does the frame: a similarity lays the new poses on the given ones. Photos without
+    observations keep theirs. False, and nothing is written, where the matches tell no points at these poses.
     """
-    model, options = load_native(sparse), pipeline_options(0)
-    options.extract_colors = False
-    before = _centres(model)
-    with TemporaryDirectory(dir=target.parent) as scratch:
-        own = Path(scratch, "database.db")
-        copy_with_cameras_of(model, database, own)
-        for limit_px in (max(MAX_ERROR_MULTIPLE * error_px, MAX_ERROR_PX), MAX_ERROR_PX):
-            options.mapper.filter_max_reproj_error = limit_px
-            options.triangulation.complete_max_reproj_error = limit_px
-            options.triangulation.merge_max_reproj_error = limit_px
-            model = triangulated(model, own, images, options)
-            noise = noise_px(model, observations(model))
-            bundle_adjust(model, set(model.cameras), adjustment_options(False, noise))
-    with suppress(ValueError):  # centres on a line: two cameras of the adjustment keep the frame
-        back = align(_centres(model), before)
-        model.transform(pycolmap.Sim3d(back.scale, pycolmap.Rotation3d(back.rotation), back.translation))
-    for point in list(model.point3D_ids()):
-        model.delete_point3D(point)
+    given, model = read_model(sparse), _at_unit_size(load_native(sparse))
+    for limit in (max(MAX_ERROR_MULTIPLE * error_px, limit_px), limit_px):
+        model = triangulated(model, database, images, limit, colours=False)
+        if not model.num_points3D():
+            return False
+        bundle_adjust(model, set(model.cameras), adjustment_options(False, noise_px(model, observations(model))))
+    adjusted = {
+        model.image(i).name: model.image(i).cam_from_world().inverse().matrix()
+        for i in model.reg_image_ids()
+        if model.image(i).num_points3D
+    }
+    before = {image.file: image.sfm_from_camera for image in given.images}
+    back = align_poses(np.array(list(adjusted.values())), np.array([before[name] for name in adjusted]))
+    poses = before | {name: back.pose(pose) for name, pose in adjusted.items()}
+    write_model(target, replace(given, images=[replace(i, sfm_from_camera=poses[i.file]) for i in given.images]))
+    return True
+
+
+def adjust_lenses(sparse: Path, database: Path, images: Path, target: Path, error_px: float, limit_px: float) -> bool:
+    """As :func:`adjust_poses`, but poses stay and cameras are adjusted, perspective ones with OPENCV's distortion."""
+    model = load_native(sparse)
+    for camera in model.cameras.values():
+        if camera.model_name in PERSPECTIVE:
+            params = dict(zip(camera.params_info.split(", "), camera.params, strict=True))
+            focal = [params.get(name, params.get("f")) for name in ("fx", "fy")]
+            radial = [params.get("k1", params.get("k", 0.0)), params.get("k2", 0.0)]
+            camera.model = pycolmap.CameraModelId.OPENCV
+            camera.params = [*focal, params["cx"], params["cy"], *radial, 0.0, 0.0]
+    limit = max(MAX_ERROR_MULTIPLE * error_px, limit_px)
+    model = triangulated(model, database, images, limit, colours=False)
+    if not model.num_points3D():
+        return False
+    adjustment = adjustment_options(True, noise_px(model, observations(model)))
+    bundle_adjust(model, set(), adjustment, constant_poses=True)
     write_native(target, model)
+    return True
 
 
-def _centres(model: pycolmap.Reconstruction) -> Float[np.ndarray, "images 3"]:
-    return np.array([model.image(i).projection_center() for i in sorted(model.reg_image_ids())])
+def _at_unit_size(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """The model about its middle, so large that its cameras are a unit from there in the median: numbers of map
+    projections are too large to be adjusted."""
+    centres = np.array([model.image(i).projection_center() for i in model.reg_image_ids()])
+    middle = np.median(centres, axis=0)
+    size = float(np.median(np.linalg.norm(centres - middle, axis=1))) or 1.0
+    model.transform(pycolmap.Sim3d(1 / size, pycolmap.Rotation3d(np.eye(3)), -middle / size))
+    return model
 
 
 def release_focal_lengths(model: pycolmap.Reconstruction, constant_cameras: Collection[int] = ()) -> None:
@@ -214,14 +232,18 @@ def bundle_adjust(
     constant_cameras: set[int],
     adjustment: pycolmap.BundleAdjustmentOptions,
     steps: int = 100,
+    constant_poses: bool = False,
 ) -> None:
     """Adjust cameras, poses and points to the observations that the model has."""
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)
+        if constant_poses:
+            config.set_constant_rig_from_world_pose(model.image(image_id).frame_id)
     for camera_id in constant_cameras:
         config.set_constant_cam_intrinsics(camera_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    if not constant_poses:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     adjustment.ceres.solver_options.max_num_iterations = steps
     pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
 

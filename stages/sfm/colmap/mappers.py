@@ -97,29 +97,36 @@ def map_globally(
     return sorted(found.values(), key=_rank, reverse=True)
 
 
-def triangulate(sparse: Path, database: Path, images: Path, target: Path, without: Collection[int]) -> int:
-    """Write to the folder ``target`` the model in ``sparse``, whose images have the database's numbers, with the points
-    that verified matches tell at its poses, which stay, as its cameras do. Images ``without`` points tell none and are
-    left out. The number of points; nothing is written where there are none.
+def triangulate(
+    sparse: Path, database: Path, images: Path, target: Path, excluded: Collection[int], limit_px: float
+) -> int:
+    """Write to the folder ``target`` the model in ``sparse``, with the database's image ids, with the points that
+    verified matches tell at its poses, which stay, as its cameras do; observations are at most ``limit_px`` off. The
+    images ``excluded`` (ids) take no part. The number of points; nothing is written where there are none.
     """
     model = load_native(sparse)
-    for image_id in without:
+    for image_id in excluded:
         model.deregister_frame(model.image(image_id).frame_id)
-    with TemporaryDirectory(dir=target.parent) as scratch:
-        copy_with_cameras_of(model, database, Path(scratch, "database.db"))
-        if model.num_reg_images() > 1:
-            model = triangulated(model, Path(scratch, "database.db"), images, pipeline_options(0))
+    if model.num_reg_images() > 1:
+        model = triangulated(model, database, images, limit_px)
     if model.num_points3D():
         write_native(target, model)
     return model.num_points3D()
 
 
 def triangulated(
-    model: pycolmap.Reconstruction, database: Path, images: Path, options: pycolmap.IncrementalPipelineOptions
+    model: pycolmap.Reconstruction, database: Path, images: Path, limit_px: float, colours: bool = True
 ) -> pycolmap.Reconstruction:
-    """The model with points at its poses by the verified matches of a database that has its cameras."""
+    """The model, with the database's image ids, with points at its poses; observations are at most ``limit_px`` off."""
+    options = pipeline_options(0)
+    options.extract_colors = colours
+    options.mapper.filter_max_reproj_error = limit_px
+    options.triangulation.complete_max_reproj_error = limit_px
+    options.triangulation.merge_max_reproj_error = limit_px
     with TemporaryDirectory(dir=database.parent) as scratch:
-        return pycolmap.triangulate_points(model, database, images, scratch, options=options)
+        own = Path(scratch, "database.db")
+        copy_with_cameras_of(model, database, own)
+        return pycolmap.triangulate_points(model, own, images, scratch, options=options)
 
 
 def _keep_largest_group(model: pycolmap.Reconstruction) -> None:

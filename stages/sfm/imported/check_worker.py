@@ -11,7 +11,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from stages.sfm.colmap.database import (
     match_pairs,
     verified_matches,
 )
-from stages.sfm.colmap.final_bundle_adjustment import adjust_poses
+from stages.sfm.colmap.final_bundle_adjustment import adjust_lenses, adjust_poses
 from stages.sfm.colmap.mappers import triangulate
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import camera_poses, check_model, facts
@@ -44,6 +44,9 @@ COMMAND = ["-P", "-m", "stages.sfm.imported.check_worker"]
 MAX_IMAGE_SIZE, MAX_FEATURES = 1000, 2000  # enough to tell a step of a few pixels, in seconds for hundreds of photos
 PARTNERS = 6  # of each photo
 MAX_NAME_STEPS = 2  # positions before and after it, in the order of names
+MAX_ERROR_PX = 4.0  # of an observation, as in mapping, on photos of MAX_IMAGE_SIZE; more on larger ones
+MAX_DOUBTFUL = 0.05  # of the photos: more that contradict their poses make poses worth an adjustment
+LENS_MARGIN = 1.5  # times the error after adjusting poses: lenses that explain the matches so well are to blame
 ADJUSTED, POINTS = "adjusted", "points"  # folders of models: with adjusted poses, with points
 TURN_DEG = 30.0  # two photos whose axes differ by so much count as far apart as two whose centres are usual neighbours
 
@@ -63,10 +66,12 @@ def check_imported_poses(
     contradict their photos and it does not, and the ``focal_fit`` of other focal lengths; or {"failed": why} where
     nothing could be compared. The model stays as it is. Where it has no points,
 
-    * inexact poses are adjusted to the matches, if ``adjust``. Where they fit then, ``folder/adjusted`` is a model
-      of all photos with these poses, and ``adjusted_from_px`` the error before; else that is None;
-    * poses that fit get points: ``folder/points`` is a model with the points that the matches tell, without those of
-      ``test_files``: ``triangulated`` many.
+    * inexact poses are adjusted to the matches, if ``adjust``. Where they fit then, ``folder/adjusted`` is a model of
+      all photos with these poses, and ``adjusted_from_px`` the error before; else that is None;
+    * poses that most pairs agree with get points: ``folder/points`` is a model with those that the matches tell,
+      without those of ``test_files``; their number is ``triangulated``.
+
+    ``unfinished``: why these two could not be tried; else None.
     """
     job = {"photos": [asdict(photo) for photo in photos], "images": str(images.absolute()), "folder": str(folder)}
     job |= {"test_files": list(test_files), "of_quaternions": of_quaternions, "adjust": adjust}
@@ -78,20 +83,23 @@ def check_imported_poses(
             stderr=log,
             env=environment(),
         )
-    if answer.returncode:
-        return {"failed": f"the check ended with code {answer.returncode}"}
-    return json.loads(answer.stdout)
+    said = [json.loads(line) for line in answer.stdout.splitlines()]  # what the check says, then what became of it
+    ended = f"the check ended with code {answer.returncode}" if answer.returncode else None
+    if ended and not said:
+        return {"failed": ended}
+    return {"adjusted_from_px": None, "triangulated": 0} | said[-1] | {"unfinished": ended}
 
 
 # --- in the child
 
 
 def main() -> None:
-    """Read the job from stdin, do it, print the answer."""
+    """Read the job from stdin, do it, print the answers: COLMAP may abort after the first."""
     job = json.loads(sys.stdin.buffer.readline())
     channel = os.dup(1)
     os.dup2(2, 1)  # nothing else may print there
-    os.write(channel, json.dumps(check(**job)).encode())
+    for answer in check(**job):
+        os.write(channel, json.dumps(answer).encode() + b"\n")
 
 
 def check(
@@ -101,27 +109,34 @@ def check(
     test_files: list[str],
     of_quaternions: bool,
     adjust: bool,
-) -> dict[str, Any]:
+) -> Iterator[dict[str, Any]]:
     """Match neighbours by pose and by name, and let their matches judge the poses, then adjust and complete them."""
     some, root, scratch = [Photo(**photo) for photo in photos], Path(folder), Path(folder, "check")
     scratch.mkdir(exist_ok=True)
+    for left in (ADJUSTED, POINTS):  # by a check that was interrupted
+        shutil.rmtree(root / left, ignore_errors=True)
     sparse, database = root / "sparse", scratch / "check.db"
     verified = _match(some, Path(images), camera_poses(load_native(sparse)), database)
     if verified < MIN_PAIRS:
         shutil.rmtree(scratch)
-        return {"failed": f"only {verified} pairs of neighbouring photos have enough matches"}
+        yield {"failed": f"only {verified} pairs of neighbouring photos have enough matches"}
+        return
     found, failed = _judge(sparse, database, of_quaternions)
-    adjusted, points = None, 0
+    yield found
+    longest = max(max(photo.width, photo.height) for photo in some)
+    limit_px = MAX_ERROR_PX * max(1.0, longest / MAX_IMAGE_SIZE)
     if not (found["fit"] or found["focal_fit"] or load_native(sparse).num_points3D()):
-        if adjust and not _fit_well(found) and (better := _adjust(sparse, database, Path(images), root, found)):
-            (found, failed), adjusted, sparse = better, found["error_px"], root / ADJUSTED
+        job = sparse, database, Path(images)
+        if adjust and not _fit_well(found) and (better := _adjusted(*job, root / ADJUSTED, found, limit_px)):
+            found, failed = found | better[0] | {"adjusted_from_px": found["error_px"]}, better[1]
+            job = root / ADJUSTED, *job[1:]
         # Photos with alpha need no points to tell the region, and edges of what is cut out are no points of a surface.
         if _mostly_agree(found) and 2 * sum(photo.has_alpha for photo in some) <= len(some):
             # Official test photos are to be as unknown as any new view.
             tests = [number for number, photo in enumerate(some, 1) if photo.image_name in test_files]
-            points = triangulate(sparse, database, Path(images), root / POINTS, {*failed, *tests})
+            found["triangulated"] = triangulate(*job, root / POINTS, {*failed, *tests}, limit_px)
     shutil.rmtree(scratch)
-    return found | {"adjusted_from_px": adjusted, "triangulated": points}
+    yield found
 
 
 def _match(photos: list[Photo], images: Path, poses: Float[np.ndarray, "photos 3 4"], database: Path) -> int:
@@ -151,15 +166,23 @@ def _judge(sparse: Path, database: Path, of_quaternions: bool) -> tuple[dict[str
     return found, checked.failed()
 
 
-def _adjust(
-    sparse: Path, database: Path, images: Path, root: Path, found: dict[str, Any]
+def _adjusted(
+    sparse: Path, database: Path, images: Path, target: Path, found: dict[str, Any], limit_px: float
 ) -> tuple[dict[str, Any], list[int]] | None:
-    """Adjust the poses, and judge again; None where they do not fit well then."""
-    adjust_poses(sparse, database, images, root / ADJUSTED, found["error_px"])
-    again = _judge(root / ADJUSTED, database, of_quaternions=False)
-    if _fit_well(again[0]) and again[0]["error_px"] < found["error_px"]:
-        return again
-    shutil.rmtree(root / ADJUSTED)
+    """Adjust the poses, and judge again; None where they do not fit well then, or where it is the lenses: poses would
+    bend to what other intrinsics explain about as well."""
+    error_px, lenses = found["error_px"], database.with_name("lenses")
+    if not adjust_poses(sparse, database, images, target, error_px, limit_px):
+        return None
+    model = load_native(target)
+    checked = check_model(model, database, 0)
+    again = facts(model, checked)
+    if _fit_well(again) and again["error_px"] < error_px:
+        tried = adjust_lenses(sparse, database, images, lenses, error_px, limit_px)
+        of_lenses = check_model(load_native(lenses), database, 0).check.median_px if tried else np.inf
+        if of_lenses > LENS_MARGIN * again["error_px"]:
+            return again, checked.failed()
+    shutil.rmtree(target)
     return None
 
 
@@ -168,7 +191,9 @@ def _mostly_agree(found: dict[str, Any]) -> bool:
 
 
 def _fit_well(found: dict[str, Any]) -> bool:
-    return found["fits"] and _mostly_agree(found)
+    """Whether poses are exact for all but a few photos."""
+    few = len(found["doubtful"]) <= MAX_DOUBTFUL * len(found["images"])
+    return found["fits"] and _mostly_agree(found) and few
 
 
 def neighbours_by_pose(world_from_camera: Float[np.ndarray, "photos 3 4"]) -> Pairs:

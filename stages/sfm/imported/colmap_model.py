@@ -59,7 +59,11 @@ def read_colmap_model(folder: Path, photos: Sequence[Photo], convention: PoseCon
         names = few(sorted(given.images[i].file for i in repeated))
         notes.append(Note("sfm.repeated-images", f"the model repeats {len(repeated)} images: {names}"))
     if not len(given.xyz):
-        notes.append(Note("sfm.no-points", "the model has no points: near and far are estimated from the camera poses"))
+        notes.append(
+            Note(
+                "sfm.no-points", "the model has no points: they are found by matches of the photos, where its poses fit"
+            )
+        )
     if behind:
         notes.append(
             Note(

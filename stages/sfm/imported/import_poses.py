@@ -162,6 +162,8 @@ def _check(
     if why := check.get("failed"):
         progress.note("sfm.poses-unchecked", f"the imported poses were not checked: {why}")
         return None
+    if why := check.pop("unfinished"):
+        progress.note("sfm.no-imported-points", f"no points were found for the imported poses: {why}; see sfm.log")
     return check
 
 
@@ -176,9 +178,10 @@ def _improved(
         moved, turned = _median_changes(model, adjusted)
         progress.note(
             "sfm.poses-adjusted",
-            "the imported poses were inexact and are adjusted to their photos: the error of the matches was "
-            f"{check['adjusted_from_px']:.1f} px and is {check['error_px']:.1f} px. Cameras moved by {moved:.2g}% of "
-            f"their extent and turned by {turned:.2g}° (median). --sfm.no-adjust-poses keeps them as they are",
+            "the imported poses do not fit the photos exactly and were adjusted: the error of the matches was "
+            f"{check['adjusted_from_px']:.1f} px and is {check['error_px']:.1f} px. The median camera moved by "
+            f"{moved:.2g}% of the cameras' extent and turned by {turned:.2g}°. To keep the poses as given, add "
+            "--sfm.no-adjust-poses",
         )
         model = replace(model, images=adjusted.images)
     if check.pop("triangulated"):
@@ -188,7 +191,7 @@ def _improved(
         model, errors = replace(model, view=view, **points), found.error_px
     if model is not known.model:
         write_model(folder / "sparse", model)
-    for scratch in (ADJUSTED, POINTS):
+    for scratch in ("check", ADJUSTED, POINTS):
         shutil.rmtree(folder / scratch, ignore_errors=True)
     return replace(known, model=model), errors
 

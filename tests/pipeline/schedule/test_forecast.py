@@ -83,7 +83,7 @@ def test_expected_sfm_time_is_roughly_right(set_of: Photos, measured: float) -> 
 
 def test_imported_poses_take_seconds() -> None:
     times = expected(Settings.model_validate({"sfm": {"cameras": Path("t.json")}}), Photos(50, 2.0))
-    assert 1 < (times["sfm"] or 0) < 10 and set(times) == set(usual())
+    assert 10 < (times["sfm"] or 0) < 60 and set(times) == set(usual())
     assert [stage for stage, seconds in times.items() if seconds is None] == ["train", "evaluate", "render", "mesh"]
 
 
