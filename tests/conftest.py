@@ -32,14 +32,6 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-FIRST = ("end_to_end", "drills", "stages", "pipeline")  # of the folders of tests: the longest files are there
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long files first: a worker that got one of them last would work alone at the end."""
-    items.sort(key=lambda item: next((i for i, name in enumerate(FIRST) if name in item.path.parts), len(FIRST)))
-
-
 pytest_plugins = ["tests.ray_cluster", "tests.synthetic_photos"]
 
 

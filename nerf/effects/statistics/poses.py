@@ -84,6 +84,7 @@ def pose_statistic(
     called_for = decide(common, noise, THRESHOLD_PX)
     if called_for is False and uncertain >= THRESHOLD_PX / GREY_ZONE:
         called_for = None
-    off = f"common reprojection error {common:.2g} ± {noise:.1g} px, pose uncertainty {uncertain:.2g} px"
+    stated_words = f"{uncertain:.2g} px" if len(stated) else "unknown"
+    off = f"common reprojection error {common:.2g} ± {noise:.1g} px, pose uncertainty {stated_words}"
     words = f"upper quartile of the photos, at 1000 pixels: {off}"
     return Statistic(max(common, uncertain), PX, THRESHOLD_PX, noise, called_for, words)
