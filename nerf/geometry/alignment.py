@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from nerf.geometry.pose_distance import rotation_angles
 from nerf.geometry.scene import Similarity
 
 MAX_DEVIATION = 3.0  # of the median one: poses farther off do not count
@@ -26,29 +27,43 @@ def align(points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"]) -
     return Similarity(scale, rotation, target_middle - scale * rotation @ middle)
 
 
-def align_poses(poses: Float[np.ndarray, "n 3 4"], targets: Float[np.ndarray, "n 3 4"]) -> Similarity:
-    """The similarity that brings camera poses, world_from_camera, closest to others of the same cameras.
+def fit_poses(base: Float[np.ndarray, "photos 3 4"], piece: Float[np.ndarray, "photos 3 4"]) -> Similarity | None:
+    """The similarity that brings poses (world from camera) of the same photos from one frame closest to the other:
+    their mean rotation, then scale and translation between their centres by least squares. None where the centres fall
+    together, which leaves the scale open.
 
-    The rotation is that of the orientations (their mean by singular value decomposition), scale and translation follow
-    from the centres: so it is determined for cameras on a line, too. Poses that are three times as far off as the
-    median one, in angle or place, do not count. The scale is 1 where all cameras stand in one place.
+    Photos on one line are enough, since their rotations tell how the pieces are turned around it.
     """
+    rotation = _mean_rotation(base, piece)
+    middle, turned = base[:, :, 3].mean(axis=0), piece[:, :, 3] @ rotation.T
+    offsets, turned_offsets = base[:, :, 3] - middle, turned - turned.mean(axis=0)
+    scale = float((offsets * turned_offsets).sum()) / max(float((turned_offsets**2).sum()), np.finfo(float).tiny)
+    if not (np.isfinite(scale) and scale > 0):
+        return None
+    return Similarity(scale, rotation, middle - scale * turned.mean(axis=0))
+
+
+def _mean_rotation(
+    base: Float[np.ndarray, "photos 3 4"], piece: Float[np.ndarray, "photos 3 4"]
+) -> Float[np.ndarray, "3 3"]:
+    u, _, vt = np.linalg.svd((base[:, :, :3] @ piece[:, :, :3].transpose(0, 2, 1)).sum(axis=0))
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+
+
+def align_poses(poses: Float[np.ndarray, "n 3 4"], targets: Float[np.ndarray, "n 3 4"]) -> Similarity:
+    """As :func:`fit_poses` brings ``poses`` to ``targets``, without those that are three times as far off as the median
+    one, in angle or place. The scale is 1 where it is open."""
     used = np.ones(len(poses), bool)
     for _ in range(2):
-        found = _aligned(poses[used], targets[used])
-        trace = np.einsum("ij,njk,nik->n", found.rotation, poses[:, :, :3], targets[:, :, :3])
-        angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+        found = _fitted_at_any_scale(targets[used], poses[used])
+        angle = rotation_angles(found.rotation @ poses[:, :, :3], targets[:, :, :3])
         distance = np.linalg.norm(found.points(poses[:, :, 3]) - targets[:, :, 3], axis=1)
         used = np.all([off <= MAX_DEVIATION * np.median(off) for off in (angle, distance)], axis=0)
-    return _aligned(poses[used], targets[used])
+    return _fitted_at_any_scale(targets[used], poses[used])
 
 
-def _aligned(poses: Float[np.ndarray, "n 3 4"], targets: Float[np.ndarray, "n 3 4"]) -> Similarity:
-    u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", targets[:, :, :3], poses[:, :, :3]))
-    rotation = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    middle, target_middle = (each[:, :, 3].mean(axis=0) for each in (poses, targets))
-    offsets, target_offsets = (poses[:, :, 3] - middle) @ rotation.T, targets[:, :, 3] - target_middle
-    size = (offsets**2).sum()
-    scale = float((offsets * target_offsets).sum() / size) if size > 0 else 1.0
-    scale = scale if scale > 0 else 1.0
-    return Similarity(scale, rotation, target_middle - scale * rotation @ middle)
+def _fitted_at_any_scale(base: Float[np.ndarray, "n 3 4"], piece: Float[np.ndarray, "n 3 4"]) -> Similarity:
+    if found := fit_poses(base, piece):
+        return found
+    rotation = _mean_rotation(base, piece)
+    return Similarity(1.0, rotation, base[:, :, 3].mean(axis=0) - rotation @ piece[:, :, 3].mean(axis=0))

@@ -13,6 +13,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float
 
+from nerf.geometry.alignment import fit_poses
 from nerf.geometry.scene import Similarity
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.repair import restricted
@@ -70,23 +71,6 @@ def join(base: pycolmap.Reconstruction, piece: pycolmap.Reconstruction) -> pycol
     joined = pycolmap.Reconstruction(base)
     _add(joined, moved)
     return joined
-
-
-def fit_poses(base: Float[np.ndarray, "photos 3 4"], piece: Float[np.ndarray, "photos 3 4"]) -> Similarity | None:
-    """The similarity that brings poses (world from camera) of the same photos from one frame closest to the other:
-    their mean rotation, then scale and translation between their centres by least squares. None where the centres fall
-    together, which leaves the scale open.
-
-    Photos on one line are enough, since their rotations tell how the pieces are turned around it.
-    """
-    u, _, vt = np.linalg.svd((base[:, :, :3] @ piece[:, :, :3].transpose(0, 2, 1)).sum(axis=0))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    middle, turned = base[:, :, 3].mean(axis=0), piece[:, :, 3] @ rotation.T
-    offsets, turned_offsets = base[:, :, 3] - middle, turned - turned.mean(axis=0)
-    scale = float((offsets * turned_offsets).sum()) / max(float((turned_offsets**2).sum()), np.finfo(float).tiny)
-    if not (np.isfinite(scale) and scale > 0):
-        return None
-    return Similarity(scale, rotation, middle - scale * turned.mean(axis=0))
 
 
 def _native(new_from_old: Similarity) -> pycolmap.Sim3d:

@@ -33,7 +33,7 @@ from stages.sfm.colmap.database import (
 from stages.sfm.colmap.final_bundle_adjustment import adjust_lenses, adjust_poses
 from stages.sfm.colmap.mappers import triangulate
 from stages.sfm.colmap.models import load_native
-from stages.sfm.colmap.repair import camera_poses, check_model, facts
+from stages.sfm.colmap.repair import Checked, camera_poses, check_model, facts
 from stages.sfm.imported.conventions import MIN_PAIRS, best_fit, fit_of_some
 from stages.sfm.imported.focal_lengths import fitting_focal_factor
 from stages.sfm.pairs.match_graph import MIN_INLIERS, natural_order, pairs_apart
@@ -116,16 +116,19 @@ def check(
     for left in (ADJUSTED, POINTS):  # by a check that was interrupted
         shutil.rmtree(root / left, ignore_errors=True)
     sparse, database = root / "sparse", scratch / "check.db"
-    verified = _match(some, Path(images), camera_poses(load_native(sparse)), database)
+    model = load_native(sparse)
+    verified = _match(some, Path(images), camera_poses(model), database)
     if verified < MIN_PAIRS:
         shutil.rmtree(scratch)
         yield {"failed": f"only {verified} pairs of neighbouring photos have enough matches"}
         return
-    found, failed = _judge(sparse, database, of_quaternions)
+    checked = check_model(model, database, 0)
+    found, failed = facts(model, checked), checked.failed()
+    found |= _other_conventions(found, checked, camera_poses(model), of_quaternions)
     yield found
     longest = max(max(photo.width, photo.height) for photo in some)
     limit_px = MAX_ERROR_PX * max(1.0, longest / MAX_IMAGE_SIZE)
-    if not (found["fit"] or found["focal_fit"] or load_native(sparse).num_points3D()):
+    if not (found["fit"] or found["focal_fit"] or model.num_points3D()):
         job = sparse, database, Path(images)
         if adjust and not _fit_well(found) and (better := _adjusted(*job, root / ADJUSTED, found, limit_px)):
             found, failed = found | better[0] | {"adjusted_from_px": found["error_px"]}, better[1]
@@ -153,17 +156,15 @@ def _match(photos: list[Photo], images: Path, poses: Float[np.ndarray, "photos 3
     return int((verified_matches(database, pairs) >= MIN_INLIERS).sum())
 
 
-def _judge(sparse: Path, database: Path, of_quaternions: bool) -> tuple[dict[str, Any], list[int]]:
-    """What the matches say of the poses, and the photos (numbered from 1) that fail the check."""
-    model = load_native(sparse)
-    checked, poses = check_model(model, database, 0), camera_poses(model)
-    found = facts(model, checked)
+def _other_conventions(
+    found: dict[str, Any], checked: Checked, poses: Float[np.ndarray, "photos 3 4"], of_quaternions: bool
+) -> dict[str, Any]:
+    """Another convention and other focal lengths that fit the matches, where the poses as given do not."""
     fit = None if _mostly_agree(found) else best_fit(checked.matches, poses, of_quaternions)
     if fit is None and found["agreeing"] < found["pairs"]:
         fit = fit_of_some(checked.matches, poses, checked.check.agrees)
     longer = None if fit or checked.fits else fitting_focal_factor(checked.matches, poses)
-    found |= {"fit": fit._asdict() if fit else None, "focal_fit": longer._asdict() if longer else None}
-    return found, checked.failed()
+    return {"fit": fit._asdict() if fit else None, "focal_fit": longer._asdict() if longer else None}
 
 
 def _adjusted(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from nerf.geometry.pose_distance import rotation_angles
 from stages.contract import Progress, StageError, listed
 from stages.io.photos import Photo, read_frame_names
 from stages.io.sparse_model import SparseModel
@@ -201,8 +202,7 @@ def _median_changes(given: SparseModel, adjusted: SparseModel) -> tuple[float, f
     before, after = (np.array([image.sfm_from_camera for image in model.images]) for model in (given, adjusted))
     extent = np.linalg.norm(np.ptp(before[:, :, 3], axis=0))
     moved = np.median(np.linalg.norm(after[:, :, 3] - before[:, :, 3], axis=1)) / extent
-    trace = np.einsum("nij,nij->n", before[:, :, :3], after[:, :, :3])  # of the rotation between them
-    turned = np.median(np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1))))
+    turned = np.degrees(np.median(rotation_angles(before[:, :, :3], after[:, :, :3])))
     return 100 * float(moved), float(turned)
 
 
