@@ -5,14 +5,9 @@ Also a backend of its own (:class:`nerf.kernels.Backend`), for machines where no
 
 from nerf.kernels.torch.adam import adam
 from nerf.kernels.torch.colour_sampling import accumulate_colours, select_colour_samples
-from nerf.kernels.torch.compositing import (
-    composite,
-    composite_backward,
-    distortion,
-    distortion_backward,
-    visible_samples,
-)
+from nerf.kernels.torch.compositing import composite, composite_backward, visible_samples
 from nerf.kernels.torch.depth_loss import depth_loss, depth_loss_backward
+from nerf.kernels.torch.distortion_loss import distortion, distortion_backward
 from nerf.kernels.torch.early_termination import finish_round, pack_rounds
 from nerf.kernels.torch.encoding import encode, encode_backward_points, encode_backward_table
 from nerf.kernels.torch.gather import gather_rows

@@ -1,4 +1,4 @@
-"""Volume rendering of packed samples (Mildenhall et al. 2020, eq. 3), and the distortion loss of its weights.
+"""Volume rendering of packed samples (Mildenhall et al. 2020, eq. 3).
 
 With the optical depth tau_i = sigma_i dt_i of sample i, T_i = exp(-sum_{j<i} tau_j) is the transmittance before it,
 T_{i+1} the one behind it, and w_i = T_i (1 - exp(-tau_i)) its weight; U = exp(-sum tau_j) is the transmittance of
@@ -17,8 +17,7 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from nerf.fields.interface import Rendering
-from nerf.kernels import RayStepping, Samples
-from nerf.kernels.torch.marching import normalised_distance
+from nerf.kernels import Samples
 
 OPAQUE = 800.0
 MIN_KEEP_PROBABILITY = 1 / 16  # of a thin sample to be kept, so that no interval becomes more than 16 times as long
@@ -72,7 +71,7 @@ def composite(
     colour = sum w_i c_i + U background, depth = sum w_i t_i + U far, opacity = 1 - U.
     """
     along = _transmittances(samples, sigma)
-    stopped = _ray_sums(samples, along.weights[:, None] * torch.cat([colour, samples.t[:, None]], -1))
+    stopped = ray_sums(samples, along.weights[:, None] * torch.cat([colour, samples.t[:, None]], -1))
     rendering = Rendering(
         colour=stopped[:, :3] + along.transmittance[:, None] * background,
         depth=stopped[:, 3] + along.transmittance * far,
@@ -99,38 +98,10 @@ def composite_backward(
     grad_seen, grad_depth = (part.index_select(0, samples.ray) for part in (grad.colour, grad.depth))
     g = grad_weights + (grad_seen * colour).sum(-1) + grad_depth * samples.t
     grad_transmittance = (grad.colour * background).sum(-1) + grad.depth * far - grad.opacity
-    behind = _sums_behind(samples, along.weights * g)
+    behind = sums_behind(samples, along.weights * g)
     transmittance = (along.transmittance * grad_transmittance).index_select(0, samples.ray)
     grad_sigma = samples.dt * (along.behind * g - behind - transmittance)
     return grad_sigma, along.weights[:, None] * grad_seen
-
-
-def distortion(samples: Samples, weights: Float[Tensor, "samples"], stepping: RayStepping) -> Float[Tensor, "rays"]:
-    """How far the weights of a ray are spread: sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i² l_i (Barron et al. 2022,
-    eq. 15), in one pass since the samples are in order: the first sum is 2 sum_i w_i sum_{j<i} w_j (m_i - m_j).
-
-    Positions m and lengths l are measured as step sizes grow, dm = dt / max(t_1, t), where steps grow from t_1 on
-    (beyond it m is log t + const), and as distances if they do not.
-
-    All in float64: m sum w_j - sum w_j m_j cancels for weights that stand close together far out.
-    """
-    m, lengths = _measure(samples, stepping)
-    w = weights.double()
-    before, moment_before = sums_before(samples, torch.stack([w, w * m]))
-    return _ray_sums(samples, 2 * w * (m * before - moment_before) + w.square() * lengths / 3).to(weights.dtype)
-
-
-def distortion_backward(
-    samples: Samples, weights: Float[Tensor, "samples"], stepping: RayStepping, grad: Float[Tensor, "rays"]
-) -> Float[Tensor, "samples"]:
-    """Gradient of the weights: 2 sum_j w_j |m_i - m_j| + 2/3 w_i l_i."""
-    m, lengths = _measure(samples, stepping)
-    w = weights.double()
-    both = torch.stack([w, w * m])
-    before, moment_before = sums_before(samples, both)
-    behind, moment_behind = _sums_behind(samples, both)
-    apart = m * (before - behind) - moment_before + moment_behind
-    return grad.index_select(0, samples.ray) * (2 * apart + 2 / 3 * w * lengths).to(weights.dtype)
 
 
 class _Transmittances(NamedTuple):
@@ -145,14 +116,15 @@ class _Transmittances(NamedTuple):
 
 def _transmittances(samples: Samples, sigma: Float[Tensor, "samples"]) -> _Transmittances:
     tau = (sigma * samples.dt).clamp(max=OPAQUE)
-    depth_before, depth = sums_before(samples, tau), _ray_sums(samples, tau)
+    depth_before, depth = sums_before(samples, tau), ray_sums(samples, tau)
     before = torch.exp(-depth_before)
     return _Transmittances(
         before, torch.exp(-depth_before - tau), before * -torch.expm1(-tau), torch.exp(-depth), -torch.expm1(-depth)
     )
 
 
-def _ray_sums(samples: Samples, values: Float[Tensor, "samples *channels"]) -> Float[Tensor, "rays *channels"]:
+def ray_sums(samples: Samples, values: Float[Tensor, "samples *channels"]) -> Float[Tensor, "rays *channels"]:
+    """Over all samples of a ray."""
     zero = values.new_zeros(len(samples.starts) - 1, *values.shape[1:], dtype=torch.float64)
     return zero.index_add(0, samples.ray.long(), values.double()).to(values.dtype)
 
@@ -166,7 +138,7 @@ def sums_before(samples: Samples, values: Float[Tensor, "*channels samples"]) ->
     return (running[..., :-1] - running.index_select(-1, first)).to(values.dtype)
 
 
-def _sums_behind(samples: Samples, values: Float[Tensor, "*channels samples"]) -> Float[Tensor, "*channels samples"]:
+def sums_behind(samples: Samples, values: Float[Tensor, "*channels samples"]) -> Float[Tensor, "*channels samples"]:
     """For each sample, the sum over those behind it on its ray."""
     if not _may_share_a_sum(values):
         return _sums_ray_by_ray(samples, samples.ray.flip(0), values.flip(-1)).flip(-1)
@@ -195,10 +167,3 @@ def _sums_ray_by_ray(
         sums[..., reach:].add_(torch.where(ray[reach:] == ray[:-reach], sums[..., :-reach], 0))
         reach *= 2
     return sums.to(values.dtype)
-
-
-def _measure(samples: Samples, stepping: RayStepping) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples"]]:
-    """Positions and lengths in the measure of the stepping, float64."""
-    t, dt = samples.t.double(), samples.dt.double()
-    lengths = dt / (stepping.linear_until * (t / stepping.linear_until).clamp(min=1)) if stepping.cone_angle else dt
-    return normalised_distance(stepping, t), lengths

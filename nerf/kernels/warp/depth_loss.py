@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.kernels import RayStepping, Samples
-from nerf.kernels.warp.compositing import log_from, normalised_difference
+from nerf.kernels.warp.distortion_loss import log_from, normalised_difference
 from nerf.kernels.warp.launch import launch
 
 wp.set_module_options({"enable_backward": False})

@@ -91,7 +91,7 @@ def _psnrs(_: Backend, error: Tensor) -> Tensor:
 CASES = [
     Case(
         formula="distortion ΣΣ w_i w_j |m_i − m_j| + ⅓ Σ w² l",
-        where="nerf/kernels/torch/compositing.py: distortion, distortion_backward",
+        where="nerf/kernels/torch/distortion_loss.py: distortion, distortion_backward",
         typical=_weights,
         extreme=_hard_weights,
         value=Bound(5e-7, "itself"),
@@ -100,7 +100,7 @@ CASES = [
     ),
     Case(
         formula="distortion where steps grow, m = log t",
-        where="nerf/kernels/torch/compositing.py: distortion, distortion_backward",
+        where="nerf/kernels/torch/distortion_loss.py: distortion, distortion_backward",
         typical=_weights,
         extreme=_hard_weights,
         value=Bound(1e-6, "itself"),

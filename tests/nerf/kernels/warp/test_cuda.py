@@ -14,7 +14,7 @@ assert nerf.kernels.warp.adam  # the package defines all kernels when it is impo
 MODULES = {
     "adam": 3,
     "colour_sampling": 3,
-    "compositing": 6,
+    "compositing": 4,
     "early_termination": 2,
     "encoding": 5,
     "gather": 1,
@@ -22,6 +22,7 @@ MODULES = {
     "marching": 4,
     "occupancy": 3,
     "depth_loss": 2,
+    "distortion_loss": 2,
     "spherical_harmonics": 1,
 }
 
