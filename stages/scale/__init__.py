@@ -67,6 +67,6 @@ def expected_seconds(config: Config, workload: Workload) -> float:
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Measure what has a known length; write scale.json."""
-    from stages.scale.references import measure_scale
+    from stages.scale.measurement import measure_scale
 
     return measure_scale(config, inputs, folder, progress)
