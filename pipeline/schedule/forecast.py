@@ -18,7 +18,7 @@ UNREADABLE_PIXELS = 2_000_000  # that a photo is taken to have until ingest says
 def photos_of(config: "IngestConfig") -> Photos | None:
     """What is to be seen of the photos without decoding any; None where they are gone or cannot be used."""
     from stages.ingest.decoding import pixel_count
-    from stages.ingest.video_frames import expected_frames
+    from stages.ingest.video.frames import expected_frames
 
     try:
         source = find_source(config.photos, config.cameras)

@@ -31,7 +31,7 @@ from stages.ingest.near_duplicates import Exposure, exposure, near_duplicates, s
 from stages.ingest.panoramas import cutting_advice
 from stages.ingest.sharpness import one_colour, relative_sharpness, sharpness
 from stages.ingest.sources import Source
-from stages.ingest.video_frames import take_frames
+from stages.ingest.video.frames import take_frames
 from stages.io.ascii_names import ascii_files
 from stages.io.files import write_jpeg, write_png
 from stages.io.photos import Box, Photo, Rejection

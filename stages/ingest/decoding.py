@@ -23,6 +23,7 @@ from stages.ingest.exif import (
     read_exif,
 )
 from stages.ingest.listing import RAW_EXTENSIONS
+from stages.ingest.orientation import turned_size, upright
 from stages.ingest.panoramas import is_panorama
 from stages.io.files import stand_in
 from stages.io.pixels import pillow
@@ -140,8 +141,8 @@ def upright_size(path: Path) -> tuple[tuple[int, int], int]:
     with _open(path) as image:
         # In a PNG without EXIF before its pixels Pillow would decode these to look behind them.
         orientation = 1 if image.format == "PNG" and "exif" not in image.info else read_exif(image, [])[1]
-        turned = orientation >= 5 and image.format != "TIFF"  # Pillow gives a TIFF's size upright
-        return ((image.height, image.width) if turned else image.size), orientation
+        size = image.size if image.format == "TIFF" else turned_size(image.size, orientation)  # Pillow turns a TIFF's
+        return size, orientation
 
 
 def _load(image: Image.Image) -> None:
@@ -312,21 +313,6 @@ def _is_identity(transform: Any, mode: str) -> bool:
     before = Image.fromarray(cube).convert(mode)
     after = ImageCms.applyTransform(before, transform)
     return int(np.abs(np.asarray(before, int) - np.asarray(after, int)).max()) <= _SRGB_TOLERANCE
-
-
-def upright(image: Image.Image, orientation: int) -> Image.Image:
-    """Undo an EXIF orientation (EXIF 2.32, tag 0x0112)."""
-    turns = pillow().Transpose
-    turn = {
-        2: turns.FLIP_LEFT_RIGHT,
-        3: turns.ROTATE_180,
-        4: turns.FLIP_TOP_BOTTOM,
-        5: turns.TRANSPOSE,
-        6: turns.ROTATE_270,
-        7: turns.TRANSVERSE,
-        8: turns.ROTATE_90,
-    }.get(orientation)
-    return image if turn is None else image.transpose(turn)
 
 
 def _camera_key(tags: dict[str, Any], width: int, height: int, orientation: int, focal_px: float | None) -> CameraKey:

@@ -9,7 +9,8 @@ import numpy as np
 from PIL import Image
 
 from stages.ingest.auxiliary_files import marks_ignored
-from stages.ingest.decoding import Decoded, DecodeError, decode, upright, upright_size
+from stages.ingest.decoding import Decoded, DecodeError, decode, upright_size
+from stages.ingest.orientation import turned_size, upright
 from stages.io.files import write_png
 from stages.io.photos import Photo
 from stages.io.pixels import pillow
@@ -47,7 +48,7 @@ def are_of_stored_pixels(pairs: Iterable[tuple[Path, Path]]) -> bool | None:
             (size, orientation), (found, _) = upright_size(photo), upright_size(mask)
         except DecodeError:  # said where it is decoded
             continue
-        fits, fits_stored = _same_shape(found, size), _same_shape(found, _stored(size, orientation))
+        fits, fits_stored = _same_shape(found, size), _same_shape(found, turned_size(size, orientation))
         if fits != fits_stored:
             told.add(fits_stored)
     return told.pop() if len(told) == 1 else None
@@ -70,7 +71,7 @@ def read_mask(file: Path, width: int, height: int, orientation: int, stored: boo
         light = np.where(light >= (USE_FROM if decoded.lossy else 1), np.uint8(0), np.uint8(255))
     pixels = np.where(light >= USE_FROM, np.uint8(255), np.uint8(0))
     size, found = (width, height), (pixels.shape[1], pixels.shape[0])
-    fits, fits_stored = _same_shape(found, size), _same_shape(found, _stored(size, orientation))
+    fits, fits_stored = _same_shape(found, size), _same_shape(found, turned_size(size, orientation))
     if not (fits or fits_stored):
         shapes = f"{found[0]}×{found[1]} and the photo is {width}×{height}"
         raise DecodeError("ingest.mask-shape", f"its mask {file.name} does not fit: it is {shapes}")
@@ -115,11 +116,6 @@ def _is_picture(light: np.ndarray) -> bool:
     """Whether many pixels are grey, in many shades: soft edges are few, labels are few values."""
     grey = light[(light > NEARLY_BLACK) & (light < NEARLY_WHITE)]
     return len(grey) > MIN_GREY * light.size and len(np.unique(grey)) > MAX_LABELS
-
-
-def _stored(size: tuple[int, int], orientation: int) -> tuple[int, int]:
-    """Width and height, in its file, of a photo that has this size upright."""
-    return (size[1], size[0]) if orientation >= 5 else size
 
 
 def _same_shape(found: tuple[int, int], wanted: tuple[int, int]) -> bool:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from stages.ingest.optical_flow import corners, follow, follow_both_ways
+from stages.ingest.video.optical_flow import corners, follow, follow_both_ways
 
 THUMBNAIL_PX = 320  # longer side: MAX_PARALLAX is then 0.8 of a pixel, which corners are followed to with ease
 # Shares of the picture's longer side. Through a usual lens of 60 degrees the parallax of a point is then below 0.15

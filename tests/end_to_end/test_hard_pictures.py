@@ -12,7 +12,7 @@ from PIL import Image
 
 from stages.contract import StageError
 from stages.ingest.decoding import MAX_PIXELS, DecodeError, decode
-from stages.ingest.video_frames import take_frames
+from stages.ingest.video.frames import take_frames
 from tests.conftest import RecordedProgress
 from tests.end_to_end.hard_scenes import RING, Picture, over_white, run, write_set
 from tests.fuzz.pictures import clip

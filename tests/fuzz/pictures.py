@@ -15,7 +15,7 @@ from stages.ingest.decoding import decode
 from stages.ingest.masks import read_mask
 from stages.ingest.near_duplicates import thumbnail
 from stages.ingest.sharpness import one_colour, sharpness
-from stages.ingest.video_frames import take_frames
+from stages.ingest.video.frames import take_frames
 from stages.io.video import video_writer
 from tests.fuzz.inputs import H, W, damaged
 

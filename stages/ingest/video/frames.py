@@ -1,7 +1,7 @@
 """The frames of a video that become photos: sharp ones, each a step of the camera away from the last.
 
 The video is decoded twice, a frame at a time: first to measure, on frames made small and grey, how far the picture has
-moved and how sharp it is, then to write the chosen ones. Those of HDR video are tone-mapped by ffmpeg's own filters.
+moved and how sharp it is, then to write the chosen ones, those of HDR video tone-mapped (tone_mapping.py).
 """
 
 import math
@@ -12,7 +12,6 @@ from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import cv2
@@ -20,10 +19,10 @@ import imageio_ffmpeg
 import numpy as np
 
 from stages.contract import Progress, StageError
-from stages.ingest.optical_flow import corners, follow_both_ways
 from stages.ingest.panoramas import cutting_advice, is_panorama
 from stages.ingest.sharpness import WIDTH, at_most, sharpness
-from stages.io.ascii_names import shell_quoted
+from stages.ingest.video.optical_flow import corners, follow_both_ways
+from stages.ingest.video.tone_mapping import srgb_filters
 from stages.io.files import stand_in, write_jpeg
 
 FLOW_WIDTH = 500  # pixels of the frames on which motion is measured
@@ -45,13 +44,6 @@ MIN_FRAMES = 3  # as sfm needs
 MAX_OVERCOUNT = 2  # frames that a whole video's container may count and not hold
 # Widths over heights of pixels: what is stored for tape has 8/11 to 2; others are wrong, 0 is unknown.
 PIXEL_ASPECTS = (0.25, 4.0)
-# Of HDR video, by ffmpeg's name of its transfer characteristic; both have the primaries of BT.2020 (ITU-R BT.2100).
-# Diffuse white is at 203 cd/m² (ITU-R BT.2408): that becomes about the white of sRGB. What is lighter, up to MAX_NITS,
-# is pressed into the lightest fifth.
-HDR_TRANSFERS = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
-# Of other video, by ffmpeg's name of its primaries.
-WIDE_PRIMARIES = {"bt2020": "BT.2020", "smpte432": "Display P3", "smpte431": "DCI P3"}
-WHITE_NITS, MAX_NITS, LINEAR_UP_TO = 203, 1000, 0.8
 JPEG_QUALITY = 95  # far closer to the frame than the video is to what the camera saw
 
 
@@ -82,7 +74,7 @@ def take_frames(video: Path, most: int, folder: Path, progress: Progress) -> lis
     The frames stand upright and their pixels are square: what the video says of its rotation and of the shape of its
     pixels is undone.
     """
-    filters = _to_srgb(video, progress)
+    filters = srgb_filters(video, progress)
     frames = _measure(video, progress)
     chosen = choose_frames(frames, most)
     if len(chosen) < MIN_FRAMES:
@@ -240,66 +232,6 @@ def _filtered(video: Path, chosen: Sequence[int], filters: str) -> Iterator[np.n
                 yield np.frombuffer(pixels, np.uint8).reshape(height, width, 3)
         finally:
             ffmpeg.kill()
-
-
-def tone_mapping(transfer: str) -> str:
-    """The filters by which ffmpeg makes sRGB of HDR video with this transfer characteristic."""
-    return (
-        f"zscale=tin={transfer}:pin=bt2020:min=2020_ncl:t=linear:npl={WHITE_NITS}:agamma=false,format=gbrpf32le,"
-        f"zscale=p=bt709,tonemap=mobius:param={LINEAR_UP_TO}:peak={MAX_NITS / WHITE_NITS:.3f}:desat=0,"
-        "zscale=t=iec61966-2-1:r=pc,format=gbrp"
-    )
-
-
-def gamut_mapping(primaries: str) -> str:
-    """The filters by which ffmpeg makes video of these primaries one of sRGB's. Its tones stay: video is shown by one
-    curve whatever its primaries."""
-    return (
-        f"zscale=pin={primaries}:tin=bt709:t=linear:m=gbr:r=pc,format=gbrpf32le,"
-        "zscale=p=bt709,zscale=t=bt709,format=gbrp"
-    )
-
-
-def _to_srgb(video: Path, progress: Progress) -> str | None:
-    """The filters by which ffmpeg makes sRGB of HDR and wide-gamut video; None of other video, and where this ffmpeg
-    lacks them. Says what is done."""
-    stream = _video_stream(video)
-    transfer = next((name for name in HDR_TRANSFERS if re.search(rf"[/ (]{name}\b", stream)), None)
-    wide = next((name for name in WIDE_PRIMARIES if re.search(rf"/{name}/|[ (]{name}[,)]", stream)), None)
-    if transfer:
-        code, what = "ingest.tone-mapped", f"{video.name} is HDR video ({HDR_TRANSFERS[transfer]})"
-        filters, done = tone_mapping(transfer), f"tone-mapped to sRGB, white at {WHITE_NITS} cd/m²"
-    elif wide:
-        code, what = "ingest.gamut-mapped", f"{video.name} has the wide gamut of {WIDE_PRIMARIES[wide]}"
-        filters, done = gamut_mapping(wide), "converted to sRGB"
-    else:
-        return None
-    if can_tone_map():
-        progress.note(code, f"{what}: its frames are {done}")
-        return filters
-    progress.note(
-        "ingest.no-tone-mapping",
-        f"{what}, and its frames are not converted: this ffmpeg lacks the filters zscale and tonemap. Convert it with "
-        f"an ffmpeg that has them: ffmpeg -i {shell_quoted(video.name)} "
-        f'-vf "{filters},format=yuv420p" -c:v libx264 -crf 12 sdr.mp4',
-    )
-    return None
-
-
-def _video_stream(video: Path) -> str:
-    """ffmpeg's line about the pixels of a video, empty where it cannot be read. Its colours stand in brackets: range,
-    then matrix/primaries/transfer, or one name where all three have the same."""
-    words = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-i", f"file:{video.resolve()}"]
-    told = subprocess.run(words, capture_output=True).stderr.decode("utf-8", "replace")
-    return next((line for line in told.splitlines() if re.match(r" *Stream #.*: Video: ", line)), "")
-
-
-@cache
-def can_tone_map() -> bool:
-    """Whether this ffmpeg was built with the filters."""
-    words = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-filters"]
-    filters = subprocess.run(words, capture_output=True).stdout.decode("utf-8", "replace")
-    return all(re.search(rf" {name} ", filters) for name in ("zscale", "tonemap"))
 
 
 @contextmanager

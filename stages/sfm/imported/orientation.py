@@ -1,13 +1,14 @@
 """Cameras of photos as their files store them, turned upright with the photos, as EXIF's orientation asks.
 
-Other programs take pixels as they are stored, ingest turns them upright. One quarter turn clockwise takes pixel (x, y)
-of a picture of height h to (h − y, x), and a camera's axes with it: X' = −Y, Y' = X.
+Other programs take pixels as they are stored, ingest turns them upright (stages/ingest/orientation.py). One quarter
+turn clockwise takes pixel (x, y) of a picture of height h to (h − y, x), and a camera's axes with it: X' = −Y, Y' = X.
 """
 
 import numpy as np
 from jaxtyping import Float
 
 from nerf.geometry.scene import Camera
+from stages.ingest.orientation import turned_size
 from stages.io.photos import Photo
 from stages.sfm.colmap.cameras import native
 
@@ -21,7 +22,7 @@ _VECTORS = (("p2", "p1"), ("p0", "p1"), ("sx1", "sy1"), ("s0", "s2"), ("s1", "s3
 
 def stored_size(photo: Photo) -> tuple[int, int]:
     """Width and height of the photo in its file, before it was turned upright."""
-    return (photo.height, photo.width) if photo.orientation >= 5 else (photo.width, photo.height)
+    return turned_size((photo.width, photo.height), photo.orientation)
 
 
 def same_shape(camera: Camera, size: tuple[int, int]) -> bool:

@@ -13,8 +13,9 @@ from PIL import Image
 
 from stages import ingest
 from stages.ingest.auxiliary_files import pair_masks
-from stages.ingest.decoding import DecodeError, upright
+from stages.ingest.decoding import DecodeError
 from stages.ingest.masks import _same_shape, are_of_stored_pixels, read_mask, write_feature_masks
+from stages.ingest.orientation import upright
 from stages.ingest.sources import find_source
 from stages.io.files import write_png
 from stages.io.photos import Photo, read_photos

@@ -11,7 +11,7 @@ from stages import ingest
 from stages.contract import StageError
 from stages.ingest import Config
 from stages.ingest.panoramas import is_panorama
-from stages.ingest.video_frames import take_frames
+from stages.ingest.video.frames import take_frames
 from stages.io.photos import read_photos
 from stages.io.video import video_writer
 from tests.blots import blots

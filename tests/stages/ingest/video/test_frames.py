@@ -14,14 +14,15 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from stages.contract import StageError
-from stages.ingest import video_frames
-from stages.ingest.video_frames import (
+from stages.ingest.video import tone_mapping
+from stages.ingest.video.frames import (
     LONG_STEP,
     LOST,
     PLENTY,
     STEP,
     Frame,
     TakenFrame,
+    _filtered,
     choose_frames,
     expected_frames,
     lacks_frames,
@@ -97,7 +98,7 @@ def test_large_frames_are_shrunk_once(tmp_path: Path, progress: Any, monkeypatch
     with video_writer(tmp_path / "a.mp4", 1200, 64, FPS) as write:
         for step in range(4):
             write(cut_out(wall, 100 * step, 10, 1200, 64))
-    monkeypatch.setattr("stages.ingest.video_frames.sharpness", lambda picture: float(sizes.append(picture.shape) or 0))
+    monkeypatch.setattr("stages.ingest.video.frames.sharpness", lambda picture: float(sizes.append(picture.shape) or 0))
     assert len(taken(tmp_path / "a.mp4", tmp_path / "out", progress)) == 4
     assert sizes == [(53, 1000)] * 4
 
@@ -181,7 +182,7 @@ def test_hdr_video_is_tone_mapped_to_srgb(
 
     assert off("mapped") < 6, "as near as JPEG and chroma of half the size allow"
     assert progress.codes[0] == "ingest.tone-mapped" and progress.names("ingest.tone-mapped", name, "203 cd/m²")
-    monkeypatch.setattr(video_frames, "can_tone_map", lambda: False)
+    monkeypatch.setattr(tone_mapping, "can_tone_map", lambda: False)
     progress.clear()
     assert off("flat") > 9
     command = progress.said("ingest.no-tone-mapping")[0].split("has them: ")[1]
@@ -234,7 +235,7 @@ def test_turned_hdr_video_stands_upright(tmp_path: Path, progress: Any) -> None:
 def test_an_hdr_frame_that_cannot_be_read_again_is_named(tmp_path: Path) -> None:
     path = hdr_clip(tmp_path / "a.mov", panned(*np.arange(4) / 6), "smpte2084")
     with pytest.raises(StageError) as caught:
-        list(video_frames._filtered(path, [1, 7], video_frames.tone_mapping("smpte2084")))
+        list(_filtered(path, [1, 7], tone_mapping.tone_mapping("smpte2084")))
     assert caught.value.code == "ingest.frame-lost" and "frame 7" in caught.value.why
 
 

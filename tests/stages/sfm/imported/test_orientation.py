@@ -13,7 +13,7 @@ from PIL import Image
 from nerf.geometry.scene import Camera
 from stages import ingest, normalise, sfm
 from stages.contract import run_stage
-from stages.ingest.decoding import upright
+from stages.ingest.orientation import upright
 from stages.io.colmap_files import PARAMETERS
 from stages.io.photos import Photo, read_photos
 from stages.io.pixels import load_pixels
