@@ -22,11 +22,11 @@ import torch
 from nerf.effects import HeldOutImages
 from nerf.fields.hash_grid import HashGridField
 from nerf.geometry.scene import Scene
-from nerf.training import hash_grid_trainer
+from nerf.training import learning_rate
 from nerf.training.evaluation_pixels import EvaluationPixels, evaluate, sample_evaluation_pixels
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.schedule import new_schedule
+from nerf.training.step_schedule import new_schedule
 from nerf.training.trainer import FieldTrainer
 from pipeline.cli.terminal import PlainDisplay
 from stages.effects.decisions import Decisions, read_decisions
@@ -139,7 +139,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, nargs="+", default=BUDGETS)
     parser.add_argument("--schedule", choices=SCHEDULES, default="whole")
     parser.add_argument(
-        "--constant", type=float, default=hash_grid_trainer.LR_HOLD_FRACTION, help="share before the rate falls"
+        "--constant", type=float, default=learning_rate.LR_HOLD_FRACTION, help="share before the rate falls"
     )
     given = parser.parse_args()
     runs = json.loads(given.runs.read_text()) if given.runs.exists() else []
@@ -147,7 +147,7 @@ def main() -> None:
         bench = None
         for seed, steps in product(given.seeds, given.steps):
             run = {"set": workspace.stem, "seed": seed, "steps": steps, "schedule": given.schedule}
-            run["constant"] = hash_grid_trainer.LR_HOLD_FRACTION = given.constant
+            run["constant"] = learning_rate.LR_HOLD_FRACTION = given.constant
             if any(run.items() <= made.items() for made in runs):
                 continue
             bench = bench or bench_of(workspace)

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.record import Record, add_out
-from nerf.training.hash_grid_trainer import LR_HOLD_FRACTION
 from nerf.training.learning_curve import MIN_STEPS, Curve, last_doubling_gain
+from nerf.training.learning_rate import LR_HOLD_FRACTION
 
 SHARE = 0.8  # of the truths that an interval is to hold
 LEAST = 0.1  # dB: by as much two seeds differ

@@ -23,17 +23,12 @@ from nerf.runtime.parallel import in_order
 from nerf.runtime.profiler import WorkCounts, span
 from nerf.runtime.randomness import generator
 from nerf.training.colour_loss import huber_loss
+from nerf.training.learning_rate import lr_multiplier
 from nerf.training.metrics import psnr
 from nerf.training.pixel_sampler import PixelSampler
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite, StepResult, all_finite
 
-LR_WARMUP_STEPS = 20
-# Fraction of the run before the learning rate begins to decay. A decay over most of the run costs short runs up to 2 dB
-# and gains long ones nothing (docs/experiments/learning_rate.md), and what is measured before it does not depend on how
-# long the run will be.
-LR_HOLD_FRACTION = 0.75
-LR_FINAL_FRACTION = 0.05  # of the base learning rate
 # The distortion loss begins weak: it concentrates floaters wherever they are, and distant surfaces of smooth colour
 # (the sky) would be pulled close behind the scene before their depth is known (docs/experiments/learning_rate.md).
 INITIAL_DISTORTION_FRACTION = 0.25  # of its weight
@@ -132,12 +127,6 @@ class Exchange(Protocol):
     def add_up(self, grad_table: Tensor) -> None:
         """In place: the sum over the processes."""
         ...
-
-
-def lr_multiplier(step: int, progress: float) -> float:
-    """The learning rate over its base: a linear warm-up, then constant, then falling exponentially."""
-    decayed = max(0.0, progress - LR_HOLD_FRACTION) / (1 - LR_HOLD_FRACTION)
-    return min(1.0, (step + 1) / LR_WARMUP_STEPS) * LR_FINAL_FRACTION**decayed
 
 
 def distortion_multiplier(progress: float) -> float:

@@ -1,6 +1,7 @@
-"""The step schedule of a run: when it ends, and which learning rate each step has.
+"""The step schedule of a run: how many steps it has, and how far it has come at each of them.
 
-``progress`` is the finished fraction of a run, from 0 to 1; everything that changes while training is a function of it.
+``progress`` is the finished fraction of a run, from 0 to 1; everything that changes while training is a function of it,
+the learning rate (learning_rate.py) above all.
 A run bounded by steps knows its progress exactly. A run bounded by seconds estimates how many steps will fit, and
 revises the estimate when the clock disagrees. The revisions are data (:class:`StepSchedule`): a resumed run that
 replays them gives every step the learning rate it had before, and continues from there by steps or by the clock.
@@ -11,7 +12,8 @@ from typing import Literal, NamedTuple
 
 Reason = Literal["begin", "clock", "target", "finish", "more"]
 
-# A run that stops early, at a target or as the user wants it, has a decay phase like any other: its last quarter.
+# A run that stops early, at a target or as the user wants it, gets the last quarter of a run, in which the hash grid's
+# learning rate decays; the vanilla NeRF's falls all the time.
 DECAY_START_PROGRESS = 0.75
 
 
@@ -113,11 +115,6 @@ def revised_by_clock(
         return schedule
     total = steps_that_fit(step, left, steps_per_second)
     return schedule if total == schedule.total_steps else schedule.revised(step, total, min(1.0, seconds / budget))
-
-
-def learning_rate(progress: float, start: float, end: float) -> float:
-    """From ``start`` to ``end`` exponentially in the progress of the run (Mildenhall et al. 2020, section 5.3)."""
-    return start * (end / start) ** progress
 
 
 def next_in_series(now: float, first: float, growth: float) -> float:

@@ -15,10 +15,10 @@ from nerf.geometry.rays import Rays
 from nerf.runtime.parallel import in_order
 from nerf.runtime.profiler import WorkCounts, span
 from nerf.runtime.randomness import generator
+from nerf.training.learning_rate import learning_rate
 from nerf.training.metrics import psnr
 from nerf.training.pixel_sampler import PixelSampler
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.schedule import learning_rate
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite, StepResult, all_finite, composite_over
 
 # Rays per chunk of a batch, each on its own core; elsewhere a batch is one chunk. Their gradients are added in order,

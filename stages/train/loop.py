@@ -26,7 +26,7 @@ from typing import Any
 from safetensors.torch import save
 
 from nerf.training.evaluation_pixels import PixelEvaluation, evaluate
-from nerf.training.schedule import (
+from nerf.training.step_schedule import (
     DECAY_START_PROGRESS,
     ScheduleRevision,
     StepSchedule,

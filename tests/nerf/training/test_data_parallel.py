@@ -16,7 +16,7 @@ from nerf.effects.exposure import ExposureModel
 from nerf.effects.pose_refinement import PoseRefinement
 from nerf.effects.vignetting import VignettingModel
 from nerf.fields.hash_grid import HashGridField
-from nerf.geometry.space_maps import Contraction
+from nerf.geometry.space_maps.contraction import Contraction
 from nerf.kernels import torch as reference
 from nerf.runtime.ranks import Ranks, leave, packed, packed_bytes, unpacker
 from nerf.training.data_parallel import LeadingTrainer, end_others, follow_first_rank

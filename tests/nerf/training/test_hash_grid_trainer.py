@@ -11,7 +11,7 @@ from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.background import background_colour
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.rays import Rays
-from nerf.geometry.space_maps import Contraction
+from nerf.geometry.space_maps.contraction import Contraction
 from nerf.kernels import torch as reference
 from nerf.training.evaluation_pixels import evaluate, sample_evaluation_pixels
 from nerf.training.hash_grid_trainer import (
@@ -19,7 +19,6 @@ from nerf.training.hash_grid_trainer import (
     HashGridTrainer,
     HashGridTrainerSettings,
     depth_loss_multiplier,
-    lr_multiplier,
 )
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from nerf.training.trainer import FieldTrainer, NonFinite
@@ -215,13 +214,6 @@ def test_unbounded_scenes_train_too() -> None:
     results = [run.step(step, step / 60) for step in range(60)]
     first, last = (sum(r.psnr for r in part) / 10 for part in (results[:10], results[-10:]))
     assert first + 3 < last < 60
-
-
-def test_the_rate_warms_up_stays_and_falls() -> None:
-    assert lr_multiplier(0, 0.0) == pytest.approx(0.05)
-    assert lr_multiplier(19, 0.1) == lr_multiplier(500, 0.75) == 1
-    assert lr_multiplier(500, 0.875) == pytest.approx(0.05**0.5)
-    assert lr_multiplier(500, 1.0) == pytest.approx(0.05)
 
 
 def test_a_state_of_another_architecture_is_refused() -> None:

@@ -4,10 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.training.schedule import (
+from nerf.training.step_schedule import (
     DECAY_START_PROGRESS,
     StepSchedule,
-    learning_rate,
     new_schedule,
     revised_by_clock,
     steps_that_fit,
@@ -138,14 +137,3 @@ def test_a_plan_that_is_right_enough_stands() -> None:
 
 def test_past_the_deadline_one_step_is_left() -> None:
     assert steps_that_fit(7, -3.0, 10.0) == 8
-
-
-@given(st.floats(0.0, 1.0), st.floats(0.0, 0.5))
-def test_equal_shares_lower_the_rate_by_equal_factors(progress: float, more: float) -> None:
-    ratio = learning_rate(progress + more, 5e-4, 5e-5) / learning_rate(progress, 5e-4, 5e-5)
-    assert ratio == pytest.approx(0.1**more, rel=1e-9)
-
-
-def test_the_rate_starts_and_ends_as_published() -> None:
-    assert learning_rate(0.0, 5e-4, 5e-5) == 5e-4
-    assert learning_rate(1.0, 5e-4, 5e-5) == pytest.approx(5e-5)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerf.training.schedule import DECAY_START_PROGRESS
+from nerf.training.step_schedule import DECAY_START_PROGRESS
 from nerf.training.trainer import NonFinite
 from stages.train import live, loop
 from stages.train.live import FINISH, LIVE, STATE, LiveFolder, ask_to_finish, touch

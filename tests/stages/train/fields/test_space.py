@@ -6,7 +6,9 @@ import torch
 
 from nerf.geometry.region_of_interest import CaptureType
 from nerf.geometry.scene import Camera, Scene, Similarity, View
-from nerf.geometry.space_maps import Box, Contraction, Ndc
+from nerf.geometry.space_maps import Box
+from nerf.geometry.space_maps.contraction import Contraction
+from nerf.geometry.space_maps.ndc import Ndc
 from nerf.training.ray_dataset import ray_dataset_from_images
 from stages.effects.decisions import Decisions
 from stages.train.config import Config
