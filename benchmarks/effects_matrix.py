@@ -19,8 +19,8 @@ from benchmarks.record import Record, add_out
 from nerf.runtime.parallel import take_over_cores
 from stages import effects
 from stages.contract import SilentProgress, run_stage
+from stages.effects.ab_runs import pilot_scene, run_pilot
 from stages.effects.decisions import Decisions, read_decisions
-from stages.effects.pilots import pilot_scene, run_pilot
 from stages.io.files import read_scene
 from tests.effect_scenes import Effects, effect_scene
 

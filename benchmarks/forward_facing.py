@@ -20,7 +20,8 @@ import torch
 from benchmarks.record import Record, add_out
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.rays import Rays
-from nerf.geometry.space_maps import Box, Contraction, SpaceMap
+from nerf.geometry.space_maps import Box, SpaceMap
+from nerf.geometry.space_maps.contraction import Contraction
 from nerf.rendering.images import render_image
 from nerf.runtime.parallel import take_over_cores, workers
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings

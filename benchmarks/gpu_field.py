@@ -25,7 +25,7 @@ from torch.distributed.rendezvous import rendezvous
 from benchmarks.record import Record, add_out
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.rays import Rays
-from nerf.geometry.space_maps import Contraction
+from nerf.geometry.space_maps.contraction import Contraction
 from nerf.kernels import warp
 from nerf.rendering.images import render_image
 from nerf.runtime.ranks import Ranks

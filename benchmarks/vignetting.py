@@ -23,7 +23,7 @@ from nerf.effects.statistics.exposure import EV
 from nerf.effects.statistics.vignetting import log_falloff
 from nerf.runtime.parallel import take_over_cores
 from stages.contract import SilentProgress
-from stages.effects import pilots
+from stages.effects import ab_runs
 from stages.effects.decisions import Decisions
 from stages.effects.scene_statistics import measured_gains, measured_vignetting, observed
 from stages.io.files import read_scene, read_tensors
@@ -44,15 +44,15 @@ def figures(made: Effects, seed: int, steps: int, folder: Path) -> dict[str, Any
     inputs = effect_scene(folder, made, seed)
     scene, points = read_scene(inputs["normalise"]), read_tensors(inputs["normalise"] / "points.safetensors")
     seen = observed(inputs["ingest"], scene, points, {}, SilentProgress())
-    trial = pilots.pilot_scene(inputs, scene, SilentProgress())
+    trial = ab_runs.pilot_scene(inputs, scene, SilentProgress())
     assert not isinstance(trial, str), trial
     names = [view.name for view in scene.of_split("train")]
     gains, falloff = (dict(zip(names, of(seen).tolist(), strict=True)) for of in (measured_gains, measured_vignetting))
     off = Decisions({"view_dependence": {}, "background": {}} | ({"exposure": gains} if made.exposure_ev else {}))
     began, scores = time.process_time(), []
     for arm in (off, off.having("vignetting", falloff)):
-        trained = pilots._trained(trial, arm, steps, 0)
-        scores.append(mean(pilots._score(trained, trial.scene, photo, False, 0) for photo in trial.kept))
+        trained = ab_runs._trained(trial, arm, steps, 0)
+        scores.append(mean(ab_runs._score(trained, trial.scene, photo, False, 0) for photo in trial.kept))
     learnt = log_falloff(U, np.array(trained.learnt["effects"]["vignetting"][names[-1]][1:])) / EV
     truth = true_curve(made.vignetting_ev)
     return {

@@ -99,7 +99,7 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
         return config.model_copy(update={"pilots": MAX_PILOTS})
     if config.seconds < MIN_TIMED_SECONDS:
         return config.model_copy(update={"pilots": 0})
-    from stages.effects.pilots import expected_seconds
+    from stages.effects.ab_runs import expected_seconds
 
     progress.update("timing a pilot")
     took, fitting = expected_seconds(read_scene(inputs["normalise"]), config.pilot_steps)

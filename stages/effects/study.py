@@ -14,10 +14,10 @@ from nerf.effects.statistics.statistic import Statistic
 from nerf.geometry.scene import Scene
 from nerf.training.trainer import NonFinite
 from stages.contract import Inputs, Progress, StageResult
-from stages.effects import pilots
+from stages.effects import ab_runs
+from stages.effects.ab_runs import Pilot, PilotScene, fits_poses
 from stages.effects.decisions import Decisions, write_decisions
 from stages.effects.effect_list import EFFECTS, Effect
-from stages.effects.pilots import Pilot, PilotScene, fits_poses
 from stages.effects.scene_statistics import WARNINGS, camera_model_statistic, observed
 from stages.io.files import read_tensors, write_json
 
@@ -166,7 +166,7 @@ class _Study:
         if fits_poses(off, on) and self.fitting_pilots == self.config.fitting_pilots:
             return "there is no time for one that fits poses"
         if self.trial is None:
-            self.trial = pilots.pilot_scene(self.inputs, self.scene, self.progress)
+            self.trial = ab_runs.pilot_scene(self.inputs, self.scene, self.progress)
         return self.trial if isinstance(self.trial, str) else None
 
     def _piloted(self, effect: Effect, off: Decisions, on: Decisions) -> Verdict:
@@ -176,10 +176,10 @@ class _Study:
         words, default = self.found.of[effect.name].words, effect.part_of_the_method
         try:
             steps, seed = self.config.pilot_steps, self.config.seed
-            pilot = pilots.run_pilot(self.trial, off, on, steps, seed, self.progress, default)
+            pilot = ab_runs.run_pilot(self.trial, off, on, steps, seed, self.progress, default)
         except NonFinite as fault:
             return Verdict(default, f"{words}; unclear, and the pilot diverged: {fault}")
-        seeds = "" if pilot.seeds == pilots.SEEDS else f" with {pilot.seeds} of {pilots.SEEDS} seeds"
+        seeds = "" if pilot.seeds == ab_runs.SEEDS else f" with {pilot.seeds} of {ab_runs.SEEDS} seeds"
         gain = f"a pilot gained {pilot.gain_db:+.2f} ± {pilot.noise_db:.2f} dB{seeds}"
         stays = not pilot.hurts if default else pilot.pays
         return Verdict(stays, f"{words}; {gain}", pilot)

@@ -15,7 +15,7 @@ import pycolmap
 from jaxtyping import Float, Int
 
 from stages.contract import Note
-from stages.sfm.colmap.camera_models import MODELS, CameraModelCandidate, degenerate_cameras, set_camera_models
+from stages.sfm.colmap.intrinsics import MODELS, CameraModelCandidate, degenerate_cameras, set_camera_models
 from stages.sfm.colmap.observations import Observations, noise_px, observations, residuals
 
 # Points for the comparison are drawn until they have so many observations: 14 candidates then take seconds.

@@ -1,4 +1,4 @@
-"""Camera models: pixels to rays and back, for every model that COLMAP knows."""
+"""Pixels to rays and back, for every camera model that COLMAP knows."""
 
 import numpy as np
 import pycolmap

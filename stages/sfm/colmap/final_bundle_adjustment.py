@@ -11,7 +11,7 @@ import pycolmap
 from nerf.geometry.alignment import align_poses
 from stages.contract import Note
 from stages.sfm.colmap.camera_model_selection import CameraModels, adjustment_options, choose
-from stages.sfm.colmap.camera_models import MODELS, degenerate_cameras, set_camera_models
+from stages.sfm.colmap.intrinsics import MODELS, degenerate_cameras, set_camera_models
 from stages.sfm.colmap.mappers import pipeline_options, triangulated
 from stages.sfm.colmap.models import load_native, read_model, write_model, write_native
 from stages.sfm.colmap.observations import noise_px, observations

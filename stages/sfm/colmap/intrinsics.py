@@ -1,4 +1,5 @@
-"""Camera models: the candidates, how a mapped camera becomes one of them, and when one is degenerate."""
+"""Intrinsics: the candidates (a camera model, its principal point refined or fixed), how a mapped camera becomes one of
+them, and when one is degenerate."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""The pose of a photo, found in a field; that it is found on photos: tests/stages/effects/test_pilots.py."""
+"""The pose of a photo, found in a field; that it is found on photos: tests/stages/effects/test_ab_runs.py."""
 
 import torch
 from torch import Tensor

@@ -11,10 +11,10 @@ from nerf.effects.exposure import expose
 from nerf.effects.pose_refinement import PoseRefinement, fit_pose
 from nerf.rendering.images import render_image
 from pipeline.engine.display import SilentDisplay
-from stages.effects import pilots
+from stages.effects import ab_runs
+from stages.effects.ab_runs import Pilot, PilotScene, pilot_scene, run_pilot
 from stages.effects.decisions import Decisions
 from stages.effects.image_effects import held_out_images, photo_effects
-from stages.effects.pilots import Pilot, PilotScene, pilot_scene, run_pilot
 from stages.io.files import read_scene
 from stages.io.pixels import load_pixels
 from tests.effect_scenes import Effects, effect_scene
@@ -33,8 +33,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def trial(inputs: dict[str, Path]) -> Iterator[PilotScene]:
     """A pilot's scene in photos of 60 × 45 pixels, for pilots of few samples."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pilots, "LONG_SIDE", 60)
-        patch.setattr(pilots, "TARGET_SAMPLES", 1 << 11)
+        patch.setattr(ab_runs, "LONG_SIDE", 60)
+        patch.setattr(ab_runs, "TARGET_SAMPLES", 1 << 11)
         made = pilot_scene(inputs, read_scene(inputs["normalise"]), SilentDisplay())
         assert not isinstance(made, str), made
         yield made
@@ -76,10 +76,10 @@ def test_validation_poses_are_fitted_wherever_poses_are_refined(
         asked.append(poses)
         return 20.0
 
-    monkeypatch.setattr(pilots, "_trained", lambda *_: None)
-    monkeypatch.setattr(pilots, "_score", score)
+    monkeypatch.setattr(ab_runs, "_trained", lambda *_: None)
+    monkeypatch.setattr(ab_runs, "_score", score)
     run_pilot(trial, off, on, 1, 0, SilentDisplay())
-    assert asked == [fitted] * (2 * pilots.SEEDS * len(trial.kept))
+    assert asked == [fitted] * (2 * ab_runs.SEEDS * len(trial.kept))
 
 
 @pytest.mark.parametrize(
@@ -103,8 +103,8 @@ def test_a_pilot_ends_when_no_change_is_to_come(
             arms.append(("on" if "exposure" in arm.on else "off", seed))
         return ("on" if "exposure" in arm.on else "off", seed)
 
-    monkeypatch.setattr(pilots, "_trained", trained)
-    monkeypatch.setattr(pilots, "_score", lambda arm, *_: 20 + (gains[arm[1]] if arm[0] == "on" else 0))
+    monkeypatch.setattr(ab_runs, "_trained", trained)
+    monkeypatch.setattr(ab_runs, "_score", lambda arm, *_: 20 + (gains[arm[1]] if arm[0] == "on" else 0))
     pilot = run_pilot(trial, PLAIN, PLAIN.having("exposure"), 2, 0, SilentDisplay(), default)
     assert sorted(arms) == sorted((arm, seed) for arm in ("on", "off") for seed in range(pairs))
     assert pilot.gain_db == pytest.approx(np.mean(gains[:pairs])) and pilot.seeds == pairs
@@ -114,7 +114,7 @@ def test_a_pilot_ends_when_no_change_is_to_come(
 def test_an_ended_pilot_would_have_proved_little() -> None:
     """Whatever the other seeds gain: of those that ended with the first one, none shows 0.2 dB."""
     others = np.arange(-1, 3, 0.01)
-    first = np.full((len(others), len(others)), pilots.MIN_GAIN_DB)
+    first = np.full((len(others), len(others)), ab_runs.MIN_GAIN_DB)
     seeds = np.stack([first, *np.meshgrid(others, others)])
     mean, noise = seeds.mean(axis=0), 4.303 / 3**0.5 * seeds.std(axis=0, ddof=1)
     assert 0.15 < mean[mean > noise].max() < 0.2
@@ -124,11 +124,11 @@ def test_a_validation_image_is_rendered_thinly(
     inputs: dict[str, Path], trial: PilotScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert trial.kept[0].colours.shape == (45, 60, 3), "a small one whole"
-    monkeypatch.setattr(pilots, "LONG_SIDE", 200)
+    monkeypatch.setattr(ab_runs, "LONG_SIDE", 200)
     large = pilot_scene(inputs, read_scene(inputs["normalise"]), SilentDisplay())
     assert isinstance(large, PilotScene)
     photo = large.kept[0]
-    assert max(photo.colours.shape[:2]) == pilots.SCORED_SIDE and photo.rays.near.shape == photo.colours.shape[:2]
+    assert max(photo.colours.shape[:2]) == ab_runs.SCORED_SIDE and photo.rays.near.shape == photo.colours.shape[:2]
 
 
 @pytest.mark.parametrize(("device", "fit"), [("cpu", 0.02), ("cuda", 0.5)])
@@ -136,14 +136,14 @@ def test_pilots_are_predicted_by_steps_and_fitted_poses(
     inputs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, device: str, fit: float
 ) -> None:
     on = {"cpu": fit, "cuda": 0.02}  # seconds of a step
-    monkeypatch.setattr(pilots, "compute_device", lambda: device)
-    monkeypatch.setattr(pilots, "cores", lambda: 16)
-    monkeypatch.setattr(pilots, "chosen_backend", lambda _device: "torch")
-    monkeypatch.setattr(pilots, "seconds_per_step", lambda *given: on[given[-1]])
+    monkeypatch.setattr(ab_runs, "compute_device", lambda: device)
+    monkeypatch.setattr(ab_runs, "cores", lambda: 16)
+    monkeypatch.setattr(ab_runs, "chosen_backend", lambda _device: "torch")
+    monkeypatch.setattr(ab_runs, "seconds_per_step", lambda *given: on[given[-1]])
     scene = read_scene(inputs["normalise"])
-    without, fitting = pilots.expected_seconds(scene, 100)
+    without, fitting = ab_runs.expected_seconds(scene, 100)
     assert without == pytest.approx(1.4 * 6 * 100 * 0.02)
-    of_fits = 6 * 4 * pilots.STEPS_PER_FIT * 4 * fit  # of a step's four chunks each on one core
+    of_fits = 6 * 4 * ab_runs.STEPS_PER_FIT * 4 * fit  # of a step's four chunks each on one core
     assert fitting - without == pytest.approx(of_fits)
 
 
@@ -167,7 +167,7 @@ def test_too_few_photos_make_no_pilot(tmp_path: Path) -> None:
 def test_heavily_masked_photos_make_no_pilot(
     left: tuple, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pilots, "LONG_SIDE", WIDTH // 2)
+    monkeypatch.setattr(ab_runs, "LONG_SIDE", WIDTH // 2)
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[left] = 255
     inputs, scene = photographed(tmp_path, views=10, mask=mask)
@@ -183,8 +183,8 @@ def test_what_pays_is_more_than_noise_and_than_nothing(gain: float, noise: float
 
 def test_noise_is_the_larger_of_seeds_and_photos() -> None:
     student = 4.303 / 3**0.5  # 97.5 % for three, over the root of how many
-    assert pilots._noise([[1.0] * 3, [3.0] * 3, [2.0] * 3]) == pytest.approx(student, rel=1e-3)
-    assert pilots._noise([[1.0, 5.0, 3.0]] * 3) == pytest.approx(2 * student, rel=1e-3)
+    assert ab_runs._noise([[1.0] * 3, [3.0] * 3, [2.0] * 3]) == pytest.approx(student, rel=1e-3)
+    assert ab_runs._noise([[1.0, 5.0, 3.0]] * 3) == pytest.approx(2 * student, rel=1e-3)
 
 
 def test_an_effect_that_gains_nothing_rarely_pays() -> None:
@@ -192,12 +192,12 @@ def test_an_effect_that_gains_nothing_rarely_pays() -> None:
     paid = 0
     for _ in range(2000):
         gains = (draw.normal(size=(3, 1)) + 0.1 * draw.normal(size=(3, 3))).tolist()  # of three seeds, of three photos
-        paid += Pilot(sum(map(sum, gains)) / 9, pilots._noise(gains), 0.0).pays
+        paid += Pilot(sum(map(sum, gains)) / 9, ab_runs._noise(gains), 0.0).pays
     assert 0.005 < paid / 2000 < 0.035
 
 
 def test_a_photos_pose_is_found_against_a_finished_field(trial: PilotScene) -> None:
-    field, photo = pilots._trained(trial, PLAIN, 150, 0).field, trial.kept[0]
+    field, photo = ab_runs._trained(trial, PLAIN, 150, 0).field, trial.kept[0]
     rays = type(photo.rays)(*(part.flatten(0, 1) for part in photo.rays))
     black, view = torch.zeros(3), torch.zeros(len(rays.near), dtype=torch.int64)
     target = render_image(field, photo.rays, black).colour.flatten(0, 1)

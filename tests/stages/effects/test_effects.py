@@ -13,9 +13,9 @@ from pipeline.engine.display import SilentDisplay
 from pipeline.engine.keys import stage_key
 from stages import effects, train
 from stages.contract import run_stage
-from stages.effects import pilots, study
+from stages.effects import ab_runs, study
+from stages.effects.ab_runs import Pilot
 from stages.effects.decisions import Decisions, read_decisions, write_decisions
-from stages.effects.pilots import Pilot
 from stages.effects.study import SceneStatistics
 from stages.io.files import write_json
 from tests.effect_scenes import Effects, effect_scene
@@ -60,7 +60,7 @@ def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
             now[0] += 3.0
             return Pilot(gain, 0.2, 0.05)
 
-        monkeypatch.setattr(pilots, "run_pilot", pilot or run_pilot)
+        monkeypatch.setattr(ab_runs, "run_pilot", pilot or run_pilot)
         folder = tmp_path / f"effects{len(list(tmp_path.iterdir()))}"
         folder.mkdir()
         result = run_stage(effects, config, inputs, folder, SilentDisplay())
@@ -217,7 +217,7 @@ def test_clear_vignetting_is_left_to_a_pilot(decided: Callable, gain: float, on:
 def test_pilots_are_made_as_far_as_they_fit(
     decided: Callable, monkeypatch: pytest.MonkeyPatch, seconds: float, pilots_made: int
 ) -> None:
-    monkeypatch.setattr(pilots, "expected_seconds", lambda *_: (30.0, 31.0))
+    monkeypatch.setattr(ab_runs, "expected_seconds", lambda *_: (30.0, 31.0))
     grey = {name: found(None) for name in ("exposure", "pose_refinement")}
     _, table, _, tried = decided(effects.Config(seconds=seconds), 1.0, **grey)
     assert len(tried) == pilots_made
@@ -238,7 +238,7 @@ def test_pilots_are_made_as_far_as_they_fit(
 def test_a_pose_fitting_pilot_must_fit_the_time(
     decided: Callable, monkeypatch: pytest.MonkeyPatch, seconds: float, made: list[str]
 ) -> None:
-    monkeypatch.setattr(pilots, "expected_seconds", lambda *_: (40.0, 60.0))
+    monkeypatch.setattr(ab_runs, "expected_seconds", lambda *_: (40.0, 60.0))
     grey = {name: found(None) for name in ("pose_refinement", "view_dependence")}
     _, table, _, tried = decided(effects.Config(seconds=seconds), -1.0, **grey)
     assert tried == made

@@ -5,8 +5,8 @@ import pycolmap
 
 from nerf.geometry.scene import Camera
 from stages.sfm.colmap.camera_model_selection import adjustment_options
-from stages.sfm.colmap.camera_models import set_camera_models
 from stages.sfm.colmap.cameras import native
+from stages.sfm.colmap.intrinsics import set_camera_models
 from stages.sfm.colmap.observations import observations, points_in_camera, residuals
 
 WIDTH, HEIGHT = 900, 600

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from nerf.geometry.scene import Camera
-from stages.sfm.colmap import camera_models, final_bundle_adjustment
+from stages.sfm.colmap import final_bundle_adjustment, intrinsics
 from stages.sfm.colmap.camera_model_selection import CameraModels, choose, hold_out, paired
-from stages.sfm.colmap.camera_models import MODELS, CameraModelCandidate, set_camera_models, why_degenerate
 from stages.sfm.colmap.cameras import native
+from stages.sfm.colmap.intrinsics import MODELS, CameraModelCandidate, set_camera_models, why_degenerate
 from stages.sfm.colmap.observations import noise_px, observations, residuals
 from tests.refusals import codes
 from tests.stages.sfm.colmap.lens_scene import HEIGHT, WIDTH, adjust, lens, mapped, photographed
@@ -117,7 +117,7 @@ def test_cameras_with_few_photos_are_judged_together() -> None:
 
 
 def test_where_every_candidate_is_degenerate_the_camera_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(camera_models, "why_degenerate", lambda camera: "it is wrong")
+    monkeypatch.setattr(intrinsics, "why_degenerate", lambda camera: "it is wrong")
     choice = choose(mapped(photographed(PINHOLE, photos=6, points=80)), 0)
     assert choice.chosen == {1: CameraModelCandidate("SIMPLE_RADIAL", False)}
     assert {row["reason"] for row in choice.table} == {"it is wrong"}
@@ -126,14 +126,14 @@ def test_where_every_candidate_is_degenerate_the_camera_stays(monkeypatch: pytes
 
 def test_few_degenerate_cameras_do_not_decide_for_others(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        camera_models,
+        intrinsics,
         "why_degenerate",
         lambda camera: "it is wrong" if camera.camera_id == 5 else why_degenerate(camera),
     )
     choice = choose(mapped(photographed(*5 * [PINHOLE], points=100)), 0)  # two photos each
     assert choice.chosen == dict.fromkeys(range(1, 6), CameraModelCandidate("SIMPLE_PINHOLE", False))
     monkeypatch.setattr(
-        camera_models,
+        intrinsics,
         "why_degenerate",
         lambda camera: "it is wrong" if camera.camera_id > 3 else why_degenerate(camera),
     )
@@ -264,9 +264,7 @@ def test_a_camera_that_comes_out_degenerate_becomes_a_pinhole(monkeypatch: pytes
 
 def test_photos_whose_camera_stays_degenerate_lose_their_places(monkeypatch: pytest.MonkeyPatch) -> None:
     model = with_a_bad_lens(monkeypatch, *5 * [PINHOLE])
-    monkeypatch.setattr(
-        camera_models, "why_degenerate", lambda camera: "it is wrong" if camera.camera_id == 5 else None
-    )
+    monkeypatch.setattr(intrinsics, "why_degenerate", lambda camera: "it is wrong" if camera.camera_id == 5 else None)
     finished = final_bundle_adjustment.final_bundle_adjustment(model, Path("matches.db"), 0, None, False)
     why = [(name, reason.code) for name, reason in finished.left_out.items()]
     assert why == [(name, "sfm.unregistered-degenerate-camera") for name in ("04.jpg", "09.jpg")]
@@ -276,6 +274,6 @@ def test_photos_whose_camera_stays_degenerate_lose_their_places(monkeypatch: pyt
 
 def test_where_most_cameras_are_degenerate_none_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     model = with_a_bad_lens(monkeypatch, PINHOLE)
-    monkeypatch.setattr(camera_models, "why_degenerate", lambda camera: "it is wrong")
+    monkeypatch.setattr(intrinsics, "why_degenerate", lambda camera: "it is wrong")
     finished = final_bundle_adjustment.final_bundle_adjustment(model, Path("matches.db"), 0, None, False)
     assert finished.left_out == {} and finished.model.num_reg_images() == 10
