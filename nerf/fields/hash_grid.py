@@ -18,7 +18,9 @@ from nerf.fields.background import background_backward, background_colour, direc
 from nerf.fields.interface import Rendering
 from nerf.fields.mlp import ColourPass, DensityPass, Weights
 from nerf.geometry.rays import Rays
-from nerf.geometry.space_maps import Box, MappedRays, Ndc, SpaceMap
+from nerf.geometry.space_maps import Box, SpaceMap
+from nerf.geometry.space_maps.mapped_rays import MappedRays
+from nerf.geometry.space_maps.ndc import Ndc
 from nerf.kernels import BOX, Backend, BinaryOccupancy, GridLayout, RayStepping, Samples, grid_layout
 from nerf.kernels.torch.occupancy import binary_occupancy, cell_numbers, is_occupied
 from nerf.rendering.early_termination import EARLY_STOP_TRANSMITTANCE, MarchingRound, march_with_early_termination

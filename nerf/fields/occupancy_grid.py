@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf.fields.hash_grid import HashGridField
-from nerf.geometry.space_maps import Ndc
+from nerf.geometry.space_maps.ndc import Ndc
 from nerf.kernels.torch.occupancy import BRICK_CELLS
 from nerf.runtime.parallel import in_order
 

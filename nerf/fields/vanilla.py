@@ -6,7 +6,7 @@ Named deviations, each with its reason:
   answers below zero, and now and then a whole network starts, and stays, there;
 * each second-stage sample is drawn from its own share of the probability (nerf/rendering/sampling.py) and the last
   interval ends at far: no sample is wasted, no length is made up;
-* ``space`` says how the scene is encoded (nerf/geometry/space_maps.py); what is not contracted is cut to the cube of
+* ``space`` says how the scene is encoded (nerf/geometry/space_maps); what is not contracted is cut to the cube of
   half size ``BOX``, because the encoding has period 2 and would repeat the scene beyond it; directions are scaled by
   ``DIRECTION_SCALE`` before they are encoded, for the same reason.
 """
@@ -23,7 +23,9 @@ from torch.nn import functional
 from nerf.fields.interface import Rendering
 from nerf.fields.positional_encoding import positional_encoding
 from nerf.geometry.rays import Rays, clip_to_box, points_on
-from nerf.geometry.space_maps import Box, MappedRays, Ndc, SpaceMap
+from nerf.geometry.space_maps import Box, SpaceMap
+from nerf.geometry.space_maps.mapped_rays import MappedRays
+from nerf.geometry.space_maps.ndc import Ndc
 from nerf.rendering.sampling import Spacing, midpoint_edges, sample_pdf, stratified
 from nerf.rendering.volume_rendering import composite, volume_weights
 from nerf.runtime.profiler import WorkCounts, span

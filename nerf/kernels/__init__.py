@@ -12,7 +12,7 @@ torch, any device, float32 or float64. The contract:
 * Samples are *packed*: those of ray r are the entries starts[r] ... starts[r + 1] - 1, front to back. A ray may have
   none.
 * Points given to the hash grid or the occupancy grid are in *unit coordinates*: [0, 1]^3 is the cube [-0.9, 0.9]^3 of a
-  bounded scene, or the contracted space [-2, 2]^3 (nerf/geometry/contraction.py).
+  bounded scene, or the contracted space [-2, 2]^3 (nerf/geometry/space_maps/contraction.py).
 * No function draws random numbers; no function fails on zero rays or zero samples.
 """
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.fields.mlp import DensityPass
-from nerf.geometry.space_maps import MappedRays
+from nerf.geometry.space_maps.mapped_rays import MappedRays
 from nerf.kernels import Backend, BinaryOccupancy, RayStepping, Samples
 from nerf.runtime.profiler import span
 

@@ -7,7 +7,8 @@ import torch
 
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.rays import Rays
-from nerf.geometry.space_maps import Contraction, Ndc
+from nerf.geometry.space_maps.contraction import Contraction
+from nerf.geometry.space_maps.ndc import Ndc
 from nerf.kernels import torch as reference
 from nerf.kernels import warp
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
-from nerf.geometry.space_maps import Contraction
+from nerf.geometry.space_maps.contraction import Contraction
 from nerf.kernels import warp
 from nerf.runtime.randomness import generator
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings

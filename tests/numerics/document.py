@@ -57,10 +57,15 @@ ELSEWHERE = {
     "tests/nerf/training/test_data_parallel.py",
     "nerf/runtime/matmul_precision.py": "lets matrix products be off by 1e-4 if that is faster: "
     "tests/nerf/runtime/test_matmul_precision.py",
-    "nerf/training/schedule.py": "learning rates within the range they are given, in float64: "
-    "tests/nerf/training/test_schedule.py",
+    "nerf/training/learning_rate.py": "within the range that is given, in float64: "
+    "tests/nerf/training/test_learning_rate.py",
+    "nerf/training/step_schedule.py": "progress from 0 to 1, in float64: tests/nerf/training/test_step_schedule.py",
     "nerf/training/learning_curve.py": "interpolation in log time, in float64: "
     "tests/nerf/training/test_learning_curve.py",
+    "nerf/geometry/space_maps/__init__.py": "the box changes nothing: "
+    "tests/nerf/geometry/space_maps/test_space_maps.py",
+    "nerf/geometry/space_maps/mapped_rays.py": "distances along straight rays, measured with normalised device "
+    "coordinates above; further laws: tests/nerf/geometry/space_maps/test_space_maps.py",
     "nerf/geometry/reconstruction.py": "float64, relative to the cameras' middle: "
     "tests/nerf/geometry/test_reconstruction.py",
     "nerf/geometry/normalisation.py": "float64, the same for every similar reconstruction, 1e6 off the origin too: "

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from nerf.fields.density_grid import DensityGrid
 from nerf.fields.positional_encoding import positional_encoding
-from nerf.geometry.contraction import contract, uncontract
 from nerf.geometry.rays import Rays, clip_to_box
+from nerf.geometry.space_maps.contraction import contract, uncontract
 from nerf.kernels import BOX, Backend, RayStepping, Samples, grid_layout, warp
 from nerf.kernels import torch as reference
 from nerf.kernels.torch.occupancy import binary_occupancy, cell_numbers

@@ -5,8 +5,14 @@ own ray from the origin. (mip-NeRF 360, Barron et al. 2022, eq. 10, with the inf
 the Euclidean one, so that the image fills a cube.)
 """
 
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
 from jaxtyping import Float
 from torch import Tensor
+
+from nerf.geometry.rays import Rays
+from nerf.geometry.space_maps.mapped_rays import MappedRays
 
 
 def contract(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
@@ -22,3 +28,25 @@ def uncontract(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """The inverse of :func:`contract` inside the open cube (-2, 2)^3: y/m · 1/(2 - m) with m = max(1, max|y_i|)."""
     m = points.abs().amax(-1, keepdim=True).clamp(min=1)
     return points / (m * (2 - m))
+
+
+@dataclass(frozen=True)
+class Contraction:
+    """All of space in (-2, 2)³."""
+
+    kind: Literal["contraction"] = "contraction"
+    half: ClassVar[float] = 2.0
+    bends_rays: ClassVar[bool] = True
+    unbounded: ClassVar[bool] = True
+
+    def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+        """Contracted points."""
+        return contract(points)
+
+    def inverse(self, mapped: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+        """The scene points again."""
+        return uncontract(mapped)
+
+    def map_rays(self, rays: Rays) -> MappedRays:
+        """Rays as they are marched."""
+        return MappedRays(rays)

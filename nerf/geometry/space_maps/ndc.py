@@ -1,124 +1,28 @@
-"""Space maps: how a scene is laid out in the cube of half side ``half``, about the origin, that a field fills.
+"""Normalised device coordinates (NDC): the space map of cameras that face one way (Mildenhall et al. 2020, appendix C).
 
-* :class:`Box`: the region of interest as it is. Nothing beyond it is seen.
-* :class:`Contraction`: all of space (nerf/geometry/contraction.py), for cameras that look anywhere.
-* :class:`Ndc`: all that cameras which face one way can see, to infinity: normalised device coordinates (Mildenhall et
-  al. 2020, appendix C).
-
-Box and Ndc take straight lines to straight lines. So rays are mapped once (:class:`MappedRays`), and what marches them
-by equal steps through a cube needs to know no map. The contraction ``bends_rays``: it is applied to every sample, and
-steps grow with the distance. Densities are per scene unit in all of them, other than in the paper: they do not depend
-on the direction, and a young field is thin before the cameras, where the cube is large and little is known.
+All that they can see, to infinity, fills the cube. Straight lines stay straight, so rays are mapped once and marched by
+equal steps. Densities are per scene unit, other than in the paper: so they do not depend on the direction, and a field
+begins thin before the cameras, where the cube is large and little is known.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from nerf import REGION_HALF_SIZE
-from nerf.geometry.contraction import contract, uncontract
 from nerf.geometry.rays import Rays
-
-SpaceName = Literal["box", "contraction", "ndc"]
+from nerf.geometry.space_maps.mapped_rays import Line, MappedRays
 
 # Of the near plane's depth: points nearer to the apex's plane than this, or behind it, are mapped as if they were here,
 # far outside of the cube.
 MIN_DEPTH = 1e-3
 MAX_ANGLE_DEG = 75.0  # of a ray off the mean axis, for a pyramid to hold it; at 90 it would be as wide as space
 AXES_TOLERANCE = 1e-6  # axes were read from JSON with all digits; what is farther off is no rotation
-MIN_REST = 1e-6  # of a ray's depth at its start over that at a sample: no sample is mapped back to beyond 1e6 times it
-
-
-class Line(NamedTuple):
-    """A ray through :class:`Ndc`: at the distance ``start`` its ``depth`` begins to change by ``slope`` per distance,
-    and it moves at ``speed`` in d / (depth at d), d being the distance from there."""
-
-    start: Float[Tensor, "*rays"]
-    depth: Float[Tensor, "*rays"]
-    slope: Float[Tensor, "*rays"]
-    speed: Float[Tensor, "*rays"]
-
-
-class MappedRays(NamedTuple):
-    """``rays`` as straight lines in the space where they are marched, and the way back. ``line``: None where that is
-    the scene itself."""
-
-    rays: Rays
-    line: Line | None = None
-
-    def to_scene(self, t: Float[Tensor, "*samples"], ray: Int[Tensor, "samples"] | None = None) -> Tensor:
-        """Distances in the scene of those along ``rays``: (rays, n), or packed ones with the ``ray`` of each."""
-        if self.line is None:
-            return t
-        start, depth, slope, speed = (each[..., None] if ray is None else each[ray] for each in self.line)
-        share = t / speed
-        return start + share * depth / (1 - share * slope).clamp(min=MIN_REST)
-
-    def scene_length(
-        self, t: Float[Tensor, "samples"], ray: Int[Tensor, "samples"]
-    ) -> float | Float[Tensor, "samples"]:
-        """Length in the scene for a length along ``rays`` at packed samples: the derivative of :meth:`to_scene`."""
-        if self.line is None:
-            return 1.0
-        _, depth, slope, speed = (each[ray] for each in self.line)
-        return depth / (speed * (1 - t / speed * slope).clamp(min=MIN_REST).square())
-
-    def from_scene(self, distance: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
-        """Distances along ``rays`` of those in the scene, one for each; 0 for what is before where they start."""
-        if self.line is None:
-            return distance
-        start, depth, slope, speed = self.line
-        beyond = (distance - start).clamp(min=0)
-        return speed * beyond / (depth + slope * beyond).clamp(min=MIN_REST * depth)
-
-
-@dataclass(frozen=True)
-class Box:
-    """The cube [-0.9, 0.9]³ of the scene frame."""
-
-    kind: Literal["box"] = "box"
-    half: ClassVar[float] = REGION_HALF_SIZE
-    bends_rays: ClassVar[bool] = False
-    unbounded: ClassVar[bool] = False
-
-    def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-        """Of scene points: themselves."""
-        return points
-
-    def inverse(self, mapped: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-        """The scene points again."""
-        return mapped
-
-    def map_rays(self, rays: Rays) -> MappedRays:
-        """Rays as they are marched."""
-        return MappedRays(rays)
-
-
-@dataclass(frozen=True)
-class Contraction:
-    """All of space in (-2, 2)³."""
-
-    kind: Literal["contraction"] = "contraction"
-    half: ClassVar[float] = 2.0
-    bends_rays: ClassVar[bool] = True
-    unbounded: ClassVar[bool] = True
-
-    def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-        """Contracted points."""
-        return contract(points)
-
-    def inverse(self, mapped: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-        """The scene points again."""
-        return uncontract(mapped)
-
-    def map_rays(self, rays: Rays) -> MappedRays:
-        """Rays as they are marched."""
-        return MappedRays(rays)
 
 
 @dataclass(frozen=True)
@@ -218,22 +122,6 @@ class Ndc:
 
     def _local(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         return (points - points.new_tensor(self.apex)) @ self._matrix(points).T
-
-
-SpaceMap = Box | Contraction | Ndc
-
-
-def space_map(kind: str, **parameters: Any) -> SpaceMap:
-    """A map by its kind and parameters, as ``dataclasses.asdict`` gives them, or JSON, which has lists for tuples.
-    Raises ValueError for an unknown kind."""
-    maps = {"box": Box, "contraction": Contraction, "ndc": Ndc}
-    if kind not in maps:
-        raise ValueError(f"the space map is {kind!r}; it must be one of {', '.join(maps)}")
-    return maps[kind](**{name: _tuples(value) for name, value in parameters.items()})
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def enclosing_ndc(

@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
 
-from nerf.geometry.contraction import contract
 from nerf.geometry.rays import Rays, clip_to_box
+from nerf.geometry.space_maps.contraction import contract
 from nerf.kernels import BOX, CONTRACTED_BOX, BinaryOccupancy, RayStepping, Samples
 from nerf.kernels.torch.occupancy import cell_numbers, is_occupied
 

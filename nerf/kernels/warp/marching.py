@@ -93,7 +93,8 @@ def t_to_s(step_size: float, cone_angle: float, t: float):
 
 @wp.func
 def _contract(point: wp.vec3):
-    """nerf.geometry.contraction.contract: the largest component r > 1 becomes 2 - 1/r, the others in proportion."""
+    """As nerf.geometry.space_maps.contraction.contract: the largest component r > 1 becomes 2 - 1/r, the others in
+    proportion."""
     r = wp.max(wp.max(wp.abs(point[0]), wp.abs(point[1])), wp.abs(point[2]))
     if r <= 1.0:
         return point

@@ -4,9 +4,9 @@ import torch
 from torch import Tensor
 
 from nerf.fields.positional_encoding import positional_encoding
-from nerf.geometry.contraction import contract, uncontract
 from nerf.geometry.rays import Rays, clip_to_box, points_on
-from nerf.geometry.space_maps import MIN_DEPTH, Ndc
+from nerf.geometry.space_maps.contraction import contract, uncontract
+from nerf.geometry.space_maps.ndc import MIN_DEPTH, Ndc
 from nerf.kernels import BOX, CONTRACTED_BOX, Backend, RayStepping, Samples
 from nerf.kernels.torch.marching import s_to_t, t_to_s
 from pipeline.doctor.numerics import Bound, Case
@@ -206,7 +206,7 @@ CASES = [
     ),
     Case(
         formula="contraction (2 − 1/r) x/r",
-        where="nerf/geometry/contraction.py: contract",
+        where="nerf/geometry/space_maps/contraction.py: contract",
         typical=lambda: (uniform(1, -3, 3, 512, 3),),
         extreme=lambda: (
             torch.tensor(
@@ -230,7 +230,7 @@ CASES = [
     ),
     Case(
         formula="its inverse y / (m (2 − m))",
-        where="nerf/geometry/contraction.py: uncontract",
+        where="nerf/geometry/space_maps/contraction.py: uncontract",
         typical=lambda: (uniform(1, -1.9, 1.9, 512, 3),),
         extreme=lambda: (
             torch.tensor([[0.0, 1e-45, -0.0], [1.0, -1.0, 0.5], [1.0000001, 0.1, 0.0], [1.9999999, 1.0, -1e-30]]),
@@ -243,7 +243,7 @@ CASES = [
     ),
     Case(
         formula="normalised device coordinates (x/z, y/z, 1 − 2 n/z)",
-        where="nerf/geometry/space_maps.py: forward, pull_back",
+        where="nerf/geometry/space_maps/ndc.py: forward, pull_back",
         typical=lambda: (torch.tensor(NDC.apex) + uniform(1, -0.5, 3, 512, 3) @ torch.tensor(NDC.axes),),
         extreme=lambda: (
             torch.tensor(NDC.apex)
@@ -259,7 +259,7 @@ CASES = [
     ),
     Case(
         formula="their inverse, z = 2 n / (1 − z')",
-        where="nerf/geometry/space_maps.py: inverse",
+        where="nerf/geometry/space_maps/ndc.py: inverse",
         typical=lambda: (uniform(1, -0.89, 0.89, 512, 3),),
         extreme=lambda: (torch.tensor([[0.0, 0.0, 0.0], [0.1, -0.2, -0.9], [0.5, 0.9, 0.893]]),),
         function=lambda _, y: NDC.inverse(y),
@@ -270,7 +270,7 @@ CASES = [
     ),
     Case(
         formula="straight rays through them",
-        where="nerf/geometry/space_maps.py: map_rays, from_scene",
+        where="nerf/geometry/space_maps/ndc.py: map_rays",
         typical=_ndc_rays,
         extreme=_hard_ndc_rays,
         function=_on_mapped_rays,

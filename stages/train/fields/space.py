@@ -4,7 +4,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nerf.geometry.space_maps import MAX_ANGLE_DEG, Box, Contraction, Ndc, SpaceMap, enclosing_ndc
+from nerf.geometry.space_maps import Box, SpaceMap
+from nerf.geometry.space_maps.contraction import Contraction
+from nerf.geometry.space_maps.ndc import MAX_ANGLE_DEG, Ndc, enclosing_ndc
 from stages.contract import StageError
 from stages.sfm.colmap.cameras import border_rays
 from stages.train.config import Config

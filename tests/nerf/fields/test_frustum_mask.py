@@ -10,9 +10,9 @@ import torch
 from nerf.fields import frustum_mask
 from nerf.fields.frustum_mask import compute_frustum_mask
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
-from nerf.geometry.contraction import uncontract
 from nerf.geometry.near_far import NEAR_MARGIN
-from nerf.geometry.space_maps import Box, Contraction, SpaceMap
+from nerf.geometry.space_maps import Box, SpaceMap
+from nerf.geometry.space_maps.contraction import Contraction, uncontract
 from nerf.kernels import CONTRACTED_BOX
 from nerf.kernels import torch as reference
 from nerf.kernels.torch.marching import unit_coordinates

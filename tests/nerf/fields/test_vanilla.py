@@ -10,7 +10,9 @@ import torch
 from nerf.fields.interface import Rendering
 from nerf.fields.vanilla import BOX, SOFTPLUS_SHIFT, VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
-from nerf.geometry.space_maps import Box, Contraction, Ndc, SpaceMap, space_map
+from nerf.geometry.space_maps import Box, SpaceMap, space_map
+from nerf.geometry.space_maps.contraction import Contraction
+from nerf.geometry.space_maps.ndc import Ndc
 from nerf.runtime.randomness import generator
 from tests.reference import paper_loop
 

@@ -36,10 +36,8 @@ def test_a_failed_selftest_is_told_and_exits_with_one(monkeypatch, capsys: pytes
     monkeypatch.setattr(doctor, "self_test", lambda device: [])
     assert commands.run_command(["doctor", "--selftest"]) == 1
     out = capsys.readouterr().out
-    assert (
-        f"problem: self-test: {case.formula} (nerf/geometry/contraction.py: contract) is off by more than its limit"
-        in out
-    )
+    where = "nerf/geometry/space_maps/contraction.py: contract"
+    assert f"problem: self-test: {case.formula} ({where}) is off by more than its limit" in out
     assert "\n  FAILED " in out and "2 formulas, 1 within their limits" in out
 
 

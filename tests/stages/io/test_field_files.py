@@ -10,7 +10,7 @@ from nerf.effects.exposure import ExposureModel
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
-from nerf.geometry.space_maps import Contraction
+from nerf.geometry.space_maps.contraction import Contraction
 from stages.contract import StageError
 from stages.hardware.backend import BackendName, backend_name, chosen_backend, load_backend
 from stages.io.field_files import load_field, save_field

@@ -1,4 +1,4 @@
-// Where rays run in the cube of the grids, and where samples stand on them: nerf/geometry/space_maps.py,
+// Where rays run in the cube of the grids, and where samples stand on them: nerf/geometry/space_maps,
 // nerf/kernels/torch/marching.py. One of SPACE_BOX, SPACE_CONTRACTION, SPACE_NDC is defined.
 
 struct Ray {

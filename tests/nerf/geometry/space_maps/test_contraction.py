@@ -3,7 +3,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.geometry.contraction import contract, uncontract
+from nerf.geometry.space_maps.contraction import contract, uncontract
 
 POINTS = 3 * torch.randn(500, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 

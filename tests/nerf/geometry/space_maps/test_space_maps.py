@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from nerf.geometry.rays import Rays, points_on
-from nerf.geometry.space_maps import MAX_ANGLE_DEG, Box, Contraction, Ndc, SpaceMap, enclosing_ndc, space_map
+from nerf.geometry.space_maps import Box, SpaceMap, space_map
+from nerf.geometry.space_maps.contraction import Contraction
+from nerf.geometry.space_maps.ndc import MAX_ANGLE_DEG, Ndc, enclosing_ndc
 from tests.camera_layouts import FIELD_OF_VIEW_TAN, ring, room, wall
 
 APEX = (0.3, -2.0, 0.1)

@@ -3,8 +3,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.geometry.contraction import contract
 from nerf.geometry.rays import Rays, clip_to_box
+from nerf.geometry.space_maps.contraction import contract
 from nerf.kernels import BOX, RayStepping
 from nerf.kernels.torch import march, occupancy_bits, sample_points, sample_points_backward
 from nerf.kernels.torch.marching import s_to_t, t_to_s

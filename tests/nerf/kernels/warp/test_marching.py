@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.geometry.contraction import uncontract
 from nerf.geometry.rays import Rays, clip_to_box
+from nerf.geometry.space_maps.contraction import uncontract
 from nerf.kernels import BOX, BinaryOccupancy, RayStepping, Samples, warp
 from nerf.kernels import torch as reference
 from nerf.kernels.torch.marching import t_to_s, unit_coordinates
