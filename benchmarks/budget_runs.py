@@ -35,7 +35,7 @@ from stages.hardware.backend import chosen_backend, load_backend
 from stages.hardware.device import compute_device
 from stages.io.files import read_json, read_scene
 from stages.train import Config
-from stages.train.data import field_background, guided_dataset, training_dataset
+from stages.train.data import dataset_with_depths, field_background, training_dataset
 from stages.train.fields.field_list import field_of, make_trainer, with_defaults
 from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.fields.space import chosen_space
@@ -80,7 +80,7 @@ def bench_of(workspace: Path) -> Bench:
     downscale = chosen_downscale(scene, rays)
     config = config.model_copy(update={"downscale": downscale})
     config = field_of(config).with_sizes(config, scene, rays)
-    train = guided_dataset(inputs, scene, downscale, PlainDisplay())
+    train = dataset_with_depths(inputs, scene, downscale, PlainDisplay())
     test = training_dataset(inputs["ingest"], scene, "test", downscale, PlainDisplay())
     shown_over = torch.tensor(field_background(config, scene))
     pixels = sample_evaluation_pixels(test, EVALUATION_PIXELS, shown_over, seed=0)

@@ -35,7 +35,7 @@ from stages.hardware.device import compute_device
 from stages.io.files import read_scene
 from stages.tradeoff.benchmark import Benchmark, make_benchmark
 from stages.train.config import Config
-from stages.train.data import guided_dataset
+from stages.train.data import dataset_with_depths
 from stages.train.fields.field_list import make_trainer, with_defaults
 from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.fields.space import chosen_space
@@ -118,7 +118,7 @@ def _progress(run: dict[str, Any], step: int, elapsed: float) -> float:
 
 def datasets(inputs: Inputs, scene: Any, downscale: float) -> dict[str, RayDataset]:
     """By the arm what it is trained on."""
-    on = guided_dataset(inputs, scene, downscale, SilentProgress(), inputs["depth"])
+    on = dataset_with_depths(inputs, scene, downscale, SilentProgress(), inputs["depth"])
     return {"off": on._replace(depth_maps=None), "on": on}
 
 

@@ -4,7 +4,7 @@
 
 Every row is a kind of photos of the demo's still life (24 photos of 240 × 180, exact tracks); every seed another still
 life, walk and draw of the effect. "right": in how many seeds exactly the effects named were on, view dependence aside,
-which is counted by itself. "gain": right halves of photos kept back, with the effect against without, after
+which is counted by itself. "gain": right halves of validation photos, with the effect against without, after
 --gain-steps steps, mean over three trainings of the first seed; of the background only on plain photos, where nothing
 else is at stake.
 """

@@ -31,7 +31,7 @@ from stages.contract import SilentProgress
 from stages.effects.decisions import Space
 from stages.hardware.backend import load_backend
 from stages.io.files import read_json, read_scene
-from stages.train.data import guided_dataset, training_dataset
+from stages.train.data import dataset_with_depths, training_dataset
 from stages.train.fields.hash_grid import (
     BASE_RES,
     DEPTH_LOSS,
@@ -174,7 +174,7 @@ def main() -> None:
     inputs = {stage: given.workspace / stage / keys[stage][:16] for stage in ("ingest", "normalise")}
     scene = read_scene(inputs["normalise"])
     data = (
-        guided_dataset(inputs, scene, 1.0, SilentProgress()),
+        dataset_with_depths(inputs, scene, 1.0, SilentProgress()),
         training_dataset(inputs["ingest"], scene, "test", 1.0, SilentProgress()),
     )
     dataset, test = (each.to(given.device) for each in data)

@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 
 from pipeline.cli.terminal import PlainDisplay
 from stages.io.files import read_scene
-from stages.train.data import guided_dataset, training_dataset
+from stages.train.data import dataset_with_depths, training_dataset
 
 SHOWN = {"ingest": "images", "normalise": "scene.json"}  # by what output/ links to, the folder of a stage
 
@@ -24,7 +24,7 @@ def main() -> None:
     folders = {name: (given.workspace / "output" / shown).resolve().parent for name, shown in SHOWN.items()}
     scene = read_scene(folders["normalise"])
     datasets = {
-        "train": guided_dataset(folders, scene, 1.0, PlainDisplay()),
+        "train": dataset_with_depths(folders, scene, 1.0, PlainDisplay()),
         "test": training_dataset(folders["ingest"], scene, "test", 1.0, PlainDisplay()),
     }
     tables = {

@@ -29,7 +29,7 @@ from stages.effects.image_effects import image_effects
 from stages.hardware.device import compute_device, cores
 from stages.io.files import read_scene
 from stages.train import Config
-from stages.train.data import guided_dataset
+from stages.train.data import dataset_with_depths
 from stages.train.fields.field_list import field_of, make_trainer
 from stages.train.profile import FIRST_PROFILED_STEP, RATES_SECONDS, profile_table, profiled_step
 
@@ -95,7 +95,7 @@ def loaded(workspace: Path, asked: Config) -> tuple[Config, Scene, RayDataset, D
         f"{grid.target_samples:,} colours in a step of {grid.micro_batches} micro-batches, {cores()} cores at work"
     )
     print(f"{sizes}, {of_step}", flush=True)
-    dataset = guided_dataset(inputs, scene, config.downscale, PlainDisplay()).to(compute_device())
+    dataset = dataset_with_depths(inputs, scene, config.downscale, PlainDisplay()).to(compute_device())
     return config, scene, dataset, read_decisions(inputs["effects"])
 
 

@@ -5,7 +5,7 @@
 Photos of tests/effect_scenes.py, darker by --ev at the corner and exposed differently by up to --exposure EV. A
 training without the effect and one with it, as A/B runs train. "measured": the corner as the tracks tell it, where
 training begins; "learnt": where it ends; "error": the largest one of the learnt curve, as a share of the corner's EV;
-"gain_db": right halves of photos kept back, with the effect less without.
+"gain_db": right halves of validation photos, with the effect less without.
 """
 
 import argparse
@@ -50,9 +50,9 @@ def figures(made: Effects, seed: int, steps: int, folder: Path) -> dict[str, Any
     gains, falloff = (dict(zip(names, of(seen).tolist(), strict=True)) for of in (measured_gains, measured_vignetting))
     off = Decisions({"view_dependence": {}, "background": {}} | ({"exposure": gains} if made.exposure_ev else {}))
     began, scores = time.process_time(), []
-    for arm in (off, off.having("vignetting", falloff)):
-        trained = ab_runs._trained(trial, arm, steps, 0)
-        scores.append(mean(ab_runs._score(trained, trial.scene, photo, False, 0) for photo in trial.kept))
+    for decisions in (off, off.having("vignetting", falloff)):
+        trained = ab_runs._trained(trial, decisions, steps, 0)
+        scores.append(mean(ab_runs._score(trained, trial.scene, photo, False, 0) for photo in trial.validation))
     learnt = log_falloff(U, np.array(trained.learnt["effects"]["vignetting"][names[-1]][1:])) / EV
     truth = true_curve(made.vignetting_ev)
     return {

@@ -129,7 +129,7 @@ def fit_pose(
     """
     here = torch.zeros(1, 3, device=target.device)
     pose, random = PoseRefinement(here, here.new_tensor([distance])), generator(target.device, seed)
-    mean, square = ({name: torch.zeros_like(part) for name, part in pose.parameters.items()} for _ in range(2))
+    exp_avg, exp_avg_sq = ({name: torch.zeros_like(part) for name, part in pose.parameters.items()} for _ in range(2))
     for step in range(FIT_STEPS):
         pixel = torch.randint(len(target), (min(FIT_RAYS, len(target)),), generator=random, device=target.device)
         places = torch.rand(2, len(pixel), generator=random, device=target.device)
@@ -137,7 +137,7 @@ def fit_pose(
         gradients = _pose_gradients(model, pose, effects, (some, target[pixel], background), places)
         rate = FIT_LEARNING_RATE * FIT_FINAL_RATE ** (step / (FIT_STEPS - 1))
         for name, gradient in gradients.items():
-            model.backend.adam(pose.parameters[name], gradient, mean[name], square[name], rate, step + 1)
+            model.backend.adam(pose.parameters[name], gradient, exp_avg[name], exp_avg_sq[name], rate, step + 1)
     return pose
 
 

@@ -41,7 +41,7 @@ def photograph(folder: Path, progress: Progress) -> tuple[str, float]:
     truth = demo_truth(LENS, PHOTOS, SEED)
     line = f"{PHOTOS} photos {LENS.width}×{LENS.height} of a still life with known cameras and surfaces"
     try:
-        _refuse_strangers(folder, truth)
+        _reject_foreign_files(folder, truth)
         if _is_done(folder, truth):
             return line, 0.0
         started = time.monotonic()
@@ -107,7 +107,7 @@ def _is_done(folder: Path, truth: Truth) -> bool:
     return known == truth.to_json() and all((folder / name).is_file() for name in truth.poses)
 
 
-def _refuse_strangers(folder: Path, truth: Truth) -> None:
+def _reject_foreign_files(folder: Path, truth: Truth) -> None:
     others = sorted(p.name for p in folder.iterdir() if p.name not in truth.poses) if folder.is_dir() else []
     if others:
         raise _cannot_write(folder, f"it holds {others[0]}, which is none of the demo's photos", "an empty folder")

@@ -68,7 +68,7 @@ def grid_work(space: Space, densities: float) -> WorkCounts:
     on this machine."""
     asked = Config(space=space, view_dependence=True)
     config = timed(with_defaults(asked), compute_device())
-    model = HashGridField(field_settings(config, sky=False), 0, reference)
+    model = HashGridField(field_settings(config, background_model=False), 0, reference)
     density, colour = mlp.density_flops(model.weights), mlp.colour_flops(model.weights)
     colours = SAMPLES_PER_RAY[space]
     rows = CORNERS * model.settings.num_levels * (densities + colours)

@@ -74,7 +74,7 @@ class Workspace:
             _refuse_links(self.root)
             names = [name for module in STAGES.values() for name in module.PUBLISHED]
             self._adopt_copies(names)
-            self._refuse_strangers(names)
+            self._reject_foreign_files(names)
             self._lock.acquire(timeout=LOCK_SECONDS)
             (self.root / ".lock.pid").write_text(f"{os.getpid()}\n")
         except Timeout:
@@ -196,7 +196,7 @@ class Workspace:
         Raises StageError where something else lies there.
         """
         (self.root / "output").mkdir(exist_ok=True)
-        self._refuse_strangers(names)
+        self._reject_foreign_files(names)
         for name in names:
             source, shown = folder / name, self._shown(name)
             if source.exists():
@@ -266,7 +266,7 @@ class Workspace:
     def _is_ours(self, shown: Path) -> bool:
         return shown.is_symlink() or shown.name in self._copies()
 
-    def _refuse_strangers(self, names: Iterable[str]) -> None:
+    def _reject_foreign_files(self, names: Iterable[str]) -> None:
         """What lies under the name of a result and is no link or copy of ours would be lost to it."""
         for shown in map(self._shown, names):
             if shown.exists() and not self._is_ours(shown):

@@ -1,7 +1,8 @@
-"""Short paired trainings that tell what an effect is worth, on photos kept back from the training photos.
+"""A/B runs (pilots): short paired trainings that tell what an effect is worth, by validation photos taken from the
+training photos.
 
-Both arms have the same seed, rays and number of steps and differ in nothing but the effect. The photos kept back have
-an exposure (and, where an arm refines poses, a pose) of their own, which neither arm knows: so they are scored by the
+Both runs have the same seed, rays and number of steps and differ in nothing but the effect. Validation photos have an
+exposure (and, where a run refines poses, a pose) of their own, which neither run knows: so they are scored by the
 half-image protocol, fitted on the left half and scored on the right one.
 
 A pilot ends with the first seed that speaks against a change, and changes nothing then. For the mean of three seeds to
@@ -30,7 +31,7 @@ from stages.evaluate.image_metrics import MIN_FOR_INTERVAL, mean_interval
 from stages.hardware.backend import chosen_backend
 from stages.hardware.device import compute_device, cores
 from stages.train.config import BLACK, Config
-from stages.train.data import ALL_MASKED, PhotoReader, guided_dataset, view_mask, view_rays
+from stages.train.data import ALL_MASKED, PhotoReader, dataset_with_depths, view_mask, view_rays
 from stages.train.fields.field_list import make_trainer, with_defaults
 from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.fields.space import chosen_space
@@ -39,13 +40,13 @@ from stages.train.validation_images import split_off_validation
 
 LONG_SIDE = 200  # pixels of the photos in a pilot
 SCORED_SIDE = 100  # of a validation image: rendering all of its pixels takes as long as training, and says the same
-MAX_KEPT = 4  # of the training photos, to judge by; with fewer than MIN_FOR_INTERVAL their own noise is not known
+MAX_VALIDATION = 4  # of the training photos, to judge by; with fewer than MIN_FOR_INTERVAL their own noise is not known
 SEEDS = 3  # at most
 TARGET_SAMPLES = 1 << 13  # half the usual: a pilot has to be short, and is judged early
 MICRO_BATCHES = 4  # fixed, so that a pilot ends the same whatever the machine
 BESIDE_TRAINING = 0.4  # of the time of the trainings: reading photos, the warm-up, scoring
-# Of a pilot's training, on one core, that take as long as fitting the pose of a photo kept back and drawing it again:
-# 7 in the scenes of tests/effect_scenes.py where alpha ends space, 20 to 26 where nothing does.
+# Of a pilot's training, on one core, that take as long as fitting the pose of a validation photo and rendering it
+# again: 7 in the scenes of tests/effect_scenes.py where alpha ends space, 20 to 26 where nothing does.
 STEPS_PER_FIT = 25
 MIN_GAIN_DB = 0.1  # a gain must exceed its noise, and this, which nobody sees
 
@@ -72,7 +73,7 @@ class Pilot(NamedTuple):
 
 
 class _Photo(NamedTuple):
-    """A photo kept back: (height, width) rays, colours and which pixels count."""
+    """A validation photo: (height, width) rays, colours and which pixels count."""
 
     view: View
     rays: Rays
@@ -85,7 +86,7 @@ class PilotScene(NamedTuple):
 
     scene: Scene
     dataset: RayDataset
-    kept: tuple[_Photo, ...]
+    validation: tuple[_Photo, ...]
 
 
 class _Trained(NamedTuple):
@@ -97,14 +98,14 @@ class _Trained(NamedTuple):
 
 def pilot_scene(inputs: Inputs, scene: Scene, progress: Progress) -> PilotScene | str:
     """Small photos to train on and to judge by, both from the training photos; or why there can be no pilot."""
-    split = split_off_validation(scene, MAX_KEPT, MIN_FOR_INTERVAL)
+    split = split_off_validation(scene, MAX_VALIDATION, MIN_FOR_INTERVAL)
     if split is None:
         return "too few training photos"
     cameras = [scene.cameras[view.camera] for view in scene.views]
     downscale = max(1.0, median(max(camera.width, camera.height) for camera in cameras) / LONG_SIDE)
     size = f"1/{downscale:.3g} of their size"
     try:
-        dataset = guided_dataset(inputs, split, downscale, progress).to(compute_device())
+        dataset = dataset_with_depths(inputs, split, downscale, progress).to(compute_device())
     except StageError as error:
         if error.code != ALL_MASKED:
             raise
@@ -120,10 +121,10 @@ def pilot_scene(inputs: Inputs, scene: Scene, progress: Progress) -> PilotScene 
         )
         for view in split.of_split("validation")
     ]
-    kept = tuple(photo for photo in map(_thinned, photos) if enough(photo.colours, photo.used))
-    if len(kept) < MIN_FOR_INTERVAL:
+    validation = tuple(photo for photo in map(_thinned, photos) if enough(photo.colours, photo.used))
+    if len(validation) < MIN_FOR_INTERVAL:
         return f"too few training photos show enough at {size}"
-    return PilotScene(split, dataset, kept)
+    return PilotScene(split, dataset, validation)
 
 
 def _thinned(photo: _Photo) -> _Photo:
@@ -135,7 +136,7 @@ def _thinned(photo: _Photo) -> _Photo:
 
 
 def fits_poses(off: Decisions, on: Decisions) -> bool:
-    """Whether a pilot of these two arms finds out where photos kept back were taken from: where neither refines poses,
+    """Whether a pilot of these two finds out where validation photos were taken from: where neither refines poses,
     they are taken as right."""
     return refines_poses({*off.on, *on.on})
 
@@ -143,11 +144,16 @@ def fits_poses(off: Decisions, on: Decisions) -> bool:
 def expected_seconds(scene: Scene, steps: int) -> tuple[float, float]:
     """What a pilot of all seeds takes here: its trainings, by a few steps of a fresh field, and what goes on beside
     them; and what such a pilot takes that fits poses, too."""
-    arm, device = Decisions({"view_dependence": {}} | ({} if scene.has_alpha else {"background": {}})), compute_device()
-    per_step = seconds_per_step(_config(arm, scene, steps, device), scene, arm, device)
+    decisions = Decisions({"view_dependence": {}} | ({} if scene.has_alpha else {"background": {}}))
+
+    def step_on(device: str) -> float:
+        return seconds_per_step(_config(decisions, scene, steps, device), scene, decisions, device)
+
+    device = compute_device()
+    per_step = step_on(device)
     trainings = (1 + BESIDE_TRAINING) * 2 * SEEDS * steps * per_step
-    on_cpu = per_step if device == "cpu" else seconds_per_step(_config(arm, scene, steps, "cpu"), scene, arm, "cpu")
-    return trainings, trainings + 2 * SEEDS * MAX_KEPT * STEPS_PER_FIT * on_cpu * min(MICRO_BATCHES, cores())
+    on_cpu = per_step if device == "cpu" else step_on("cpu")
+    return trainings, trainings + 2 * SEEDS * MAX_VALIDATION * STEPS_PER_FIT * on_cpu * min(MICRO_BATCHES, cores())
 
 
 def run_pilot(
@@ -159,10 +165,10 @@ def run_pilot(
     progress: Progress,
     default: bool | None = None,
 ) -> Pilot:
-    """Train both arms for each seed and compare; no more seeds once an effect clearly stays as it is by ``default``, on
-    or off. Raises NonFinite where an arm diverges."""
+    """Train both runs for each seed and compare; no more seeds once an effect clearly stays as it is by ``default``, on
+    or off. Raises NonFinite where a run diverges."""
     gains: list[list[float]] = []
-    arms, seconds = {"off": off, "on": on}, {"off": 0.0, "on": 0.0}
+    decisions, seconds = {"off": off, "on": on}, {"off": 0.0, "on": 0.0}
     poses = fits_poses(off, on)
     _trained(trial, off, 1, seed)  # pays for kernels and memory
     for number in range(SEEDS):
@@ -171,9 +177,9 @@ def run_pilot(
             done = (2 * number + len(scores)) / (2 * SEEDS)
             progress.update(f"pilot training {2 * number + len(scores) + 1} of {2 * SEEDS}", done)
             started = time.perf_counter()
-            trained = _trained(trial, arms[name], steps, seed + number)
+            trained = _trained(trial, decisions[name], steps, seed + number)
             seconds[name] += time.perf_counter() - started
-            scores[name] = [_score(trained, trial.scene, photo, poses, seed) for photo in trial.kept]
+            scores[name] = [_score(trained, trial.scene, photo, poses, seed) for photo in trial.validation]
         gains.append([with_it - without for with_it, without in zip(scores["on"], scores["off"], strict=True)])
         if default is not None and (-1 if default else 1) * mean(gains[-1]) < MIN_GAIN_DB:
             break
@@ -189,11 +195,11 @@ def _noise(gains: list[list[float]]) -> float:
     return max((high - low) / 2 for low, high in intervals)
 
 
-def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> _Trained:
-    """A hash-grid field after ``steps`` steps under the decisions of one arm."""
+def _trained(trial: PilotScene, decisions: Decisions, steps: int, seed: int) -> _Trained:
+    """A hash-grid field after ``steps`` steps under the decisions of one run."""
     views = trial.scene.of_split("train")
-    effects = image_effects(arm, trial.scene, views, trial.dataset)
-    config = _config(arm, trial.scene, steps, trial.dataset.device.type)
+    effects = image_effects(decisions, trial.scene, views, trial.dataset)
+    config = _config(decisions, trial.scene, steps, trial.dataset.device.type)
     trainer = make_trainer(config, trial.scene, trial.dataset, seed, effects)
     for step in range(steps):
         trainer.step(step, step / steps, 1.0)
@@ -201,13 +207,13 @@ def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> _Train
     return _Trained(trainer.model.to("cpu"), {"effects": learnt_effects(trainer.effects, views)})
 
 
-def _config(arm: Decisions, scene: Scene, steps: int, device: str) -> Config:
+def _config(decisions: Decisions, scene: Scene, steps: int, device: str) -> Config:
     """A small hash-grid field with what stage train would choose."""
     return with_defaults(
         Config(
             steps=steps,
-            space=chosen_space(arm, scene)[0],
-            view_dependence="view_dependence" in arm.on,
+            space=chosen_space(decisions, scene)[0],
+            view_dependence="view_dependence" in decisions.on,
             grid=HashGridOptions(
                 backend=chosen_backend(device),
                 micro_batches=MICRO_BATCHES,
@@ -229,5 +235,5 @@ def _score(trained: _Trained, scene: Scene, photo: _Photo, poses: bool, seed: in
         rays = from_fitted_pose(trained.field, photo.rays, picture, black, photo.colours, photo.used, effects, seed)
         picture = render_image(shown, rays, black)
     _, fitted = right_half_psnr(picture, black, photo.colours, photo.used)
-    assert fitted is not None, "pilot_scene keeps no photo that has too few pixels"
+    assert fitted is not None, "pilot_scene takes no photo that has too few pixels"
     return fitted

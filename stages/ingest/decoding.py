@@ -53,7 +53,7 @@ class DecodeError(Exception):
 class CameraKey(NamedTuple):
     """Photos for which all of this agrees share intrinsics. Orientation counts: it moves the principal point.
 
-    ``focal_px`` is for pixels of ``width`` × ``height``, None where EXIF tells none or an absurd one.
+    ``focal_px`` is for pixels of ``width`` × ``height``, None where EXIF tells none or one out of FOCAL_RANGE.
     """
 
     make: str

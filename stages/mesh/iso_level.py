@@ -1,10 +1,10 @@
 """The density of the surface: the iso-level nearest to where the photos' own rays stop.
 
-A radiance field has no surface, only density, and no fixed iso-level suits every field: a short training leaves fog of
-a few units, a long one walls of thousands. What the photos constrain is where rays stop. So rays of the training photos
-are followed through the field to their median depth (half of the transmittance lost), and of a range of densities the
-one is chosen whose surface those rays meet nearest to it. Holes, crusts and floaters all count, because a ray that
-stops without meeting the surface, or meets it without stopping, costs the full clip.
+A radiance field has no surface, only density, and no fixed iso-level suits every field: a short training leaves
+densities of a few units, a long one walls of thousands. What the photos constrain is where rays stop. So rays of the
+training photos are followed through the field to their median depth (half of the transmittance lost), and of a range of
+densities the one is chosen whose surface those rays meet nearest to it. Holes, crusts and floaters all count, because a
+ray that stops without meeting the surface, or meets it without stopping, costs the full clip.
 """
 
 import math

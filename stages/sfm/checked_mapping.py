@@ -70,13 +70,13 @@ def run_mapping(
     seed, camera_is_known = state.job.seed, state.job.camera_params is not None
     models, matches = Path(state.job.folder, "models"), database
     mapping = strategy.mapping or MappingOptions()
-    hold_focal = told_by_few = False
+    hold_focal = calibrated = False
     if state.thinned:
         matches = state.sibling("thinned")
         hold_focal = thin_matches(database, matches, camera_is_known=camera_is_known) and mapping.hold_focal
         if hold_focal and strategy.mapping is not None:
-            told_by_few = calibrate_by_few(matches, mapping, state)
-    beside = _start_global_mapping(strategy, matches, camera_is_known or told_by_few, state)
+            calibrated = calibrate_by_few(matches, mapping, state)
+    comparison = _start_global_mapping(strategy, matches, camera_is_known or calibrated, state)
     options = incremental_options(seed, mapping, camera_is_known, state.thinned, hold_focal)
     trusted = consecutive_pairs(state) if strategy.matches == "consecutive" else set[tuple[int, int]]()
     if strategy.mapping is None:
@@ -89,9 +89,9 @@ def run_mapping(
         if found and trusted:
             found = _most_steps(found, matches, mapping, hold_focal, state, trusted)
     checked = CheckedModel(None, {}, False, False)
-    failure = global_mapping.failure(beside) if beside else None
-    other = load_native(beside.folder) if beside and not failure else None
-    compared = None if beside is None else {"failed": failure}
+    failure = global_mapping.failure(comparison) if comparison else None
+    other = load_native(comparison.folder) if comparison and not failure else None
+    compared = None if comparison is None else {"failed": failure}
     if found:
         before = found[0]
         if trusted:

@@ -42,9 +42,9 @@ from stages.sfm.pairs.pair_selection import (
     capture_priors,
     exhaustive,
     expected_pairs,
-    second_look,
     start_pairs,
     union,
+    with_more_pairs,
 )
 from stages.sfm.retry_strategies import Strategy
 
@@ -62,7 +62,12 @@ def match_photos(strategy: Strategy, missing: list[int], state: JobState) -> tup
         database = state.sibling("relaxed")
         before = matched_pairs(state.latest())
         copy_without_matches_of({state.files[number] for number in missing}, state.latest(), database)
-        _match(database, second_look(before, missing, job.neighbours, lambda: state.similarity), RELAXED_RATIO, state)
+        _match(
+            database,
+            with_more_pairs(before, missing, job.neighbours, lambda: state.similarity),
+            RELAXED_RATIO,
+            state,
+        )
     elif strategy.matches == "consecutive":
         database = state.sibling("consecutive")
         tried, kept = (matched_pairs(state.database) + 1).tolist(), consecutive_pairs(state)
@@ -84,12 +89,12 @@ def _extract(database: Path, extraction: ExtractionOptions, state: JobState) -> 
     masks = Path(state.job.folder, "masks")
     if write_feature_masks(state.images.parent, state.photos, masks):
         extraction = extraction._replace(masks=masks)
-    extract_features(database, state.images, state.photos, extraction, partial(_tell_few, state))
+    extract_features(database, state.images, state.photos, extraction, partial(_note_few_features, state))
     shutil.rmtree(masks, ignore_errors=True)
     state.end("features")
 
 
-def _tell_few(state: JobState, median: float) -> None:
+def _note_few_features(state: JobState, median: float) -> None:
     few = f"the photos yield few features (median {median:,.0f})"
     what = f"{few}: extracting from photos enlarged to four times the pixels"
     state.send(note=Note("sfm.features-enlarged", what))

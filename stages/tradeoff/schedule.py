@@ -38,7 +38,7 @@ MAX_SCORING = 0.03  # of the study's time, for one score: where it would take mo
 SCORING_STRIDE = 4  # is rendered, along both axes of the tiles
 MAX_RUN = 1 / 6  # of the study's time, for one run
 RENDERING_SPEED: dict[FieldName, float] = {"grid": 0.7, "vanilla": 3.0}
-"""Rays rendered a second over rays trained, about: rendering does less, but a grid field of few steps is all fog."""
+"""Rays rendered a second over rays trained, about: rendering does less, but floaters fill a grid field of few steps."""
 OTHER_TIME = 0.03  # of the study's time: measuring speeds before it, drawing plots after it
 
 GridSize = Literal["small", "usual", "large"]

@@ -58,8 +58,8 @@ def camera_directions(camera: "Camera", downscale: float | None) -> "Tensor":
 
 
 def patch_directions(camera: "Camera", downscale: float | None) -> "Tensor":
-    """Bearing vectors (rows, columns, 3) of a camera in the middles of the patches that stand for its pixels in a ray
-    dataset, MAX_PATCHES along the longer side or one per pixel."""
+    """Unit ray directions (rows, columns, 3) of a camera in the middles of the patches that stand for its pixels in a
+    ray dataset, MAX_PATCHES along the longer side or one per pixel."""
     width, height = scaled_size(camera, downscale)
     shrink = max(1.0, max(width, height) / MAX_PATCHES)
     return torch.from_numpy(camera_rays(camera, math.ceil(width / shrink), math.ceil(height / shrink)))
@@ -96,13 +96,13 @@ def training_dataset(
     return _masked(dataset, masks, split, progress)
 
 
-def guided_dataset(
+def dataset_with_depths(
     inputs: Inputs, scene: "Scene", downscale: float, progress: Progress, depth: Path | None = None
 ) -> RayDataset:
-    """:func:`training_dataset` of the training photos, which knows how far away are the sparse points that they show;
-    and their depth maps, where the folder of stage ``depth`` is given.
+    """:func:`training_dataset` of the training photos, with the distances of the sparse points that they show, and with
+    their depth maps where the folder of stage ``depth`` is given.
 
-    Of normalise's points only those that two training photos saw at least, where these saw them."""
+    Only points of normalise that at least two training photos saw count, where these saw them."""
     dataset = training_dataset(inputs["ingest"], scene, "train", downscale, progress)
     points = read_tensors(inputs["normalise"] / "points.safetensors")
     tracks, xy = training_tracks(scene, points, most=len(points["view"]))

@@ -38,7 +38,7 @@ from stages.train.curve import (
     target_message,
     write_curve,
 )
-from stages.train.data import field_background, guided_dataset
+from stages.train.data import dataset_with_depths, field_background
 from stages.train.fields.field_list import field_of, make_trainer
 from stages.train.live import LiveFolder
 from stages.train.loop import TrainingRun
@@ -173,7 +173,7 @@ def _dataset(config: Config, scene: Scene, inputs: Inputs, progress: Progress) -
     """The training photos, on the device that trains."""
     assert config.downscale is not None, "plan() chooses it"
     depth = inputs["depth"] if config.depth else None
-    return guided_dataset(inputs, scene, config.downscale, progress, depth).to(compute_device())
+    return dataset_with_depths(inputs, scene, config.downscale, progress, depth).to(compute_device())
 
 
 def _trainers(config: Config, scene: Scene, inputs: Inputs, dataset: RayDataset) -> Callable[[int], FieldTrainer]:

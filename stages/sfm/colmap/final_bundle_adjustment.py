@@ -23,7 +23,8 @@ MIN_GROWTH_TO_CHOOSE_AGAIN = 1.1
 SIMPLEST = MODELS[0]
 MAX_ERROR_MULTIPLE = 5.0  # of the median error of imported poses: observations that are farther off do not count
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # what OPENCV has more parameters than
-CLOSING_STEPS = (3, 3)  # of the adjustment of all observations, before and after those that fit no more are dropped
+# Of the adjustment of all observations, before and after those that fit no more are dropped.
+FINAL_ITERATIONS = (3, 3)
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class AdjustedModel:
     camera_models: list[dict[str, Any]]  # the comparison, a row per candidate (registration.json)
     notes: list[Note]
     uncertainty_px: dict[str, float]  # by the image's name
-    left_out: dict[str, Note]  # by the image's name, why its camera cannot be used: it has no place any more
+    left_out: dict[str, Note]  # by the image's name, why its camera cannot be used: it is registered no more
 
 
 def final_bundle_adjustment(
@@ -150,15 +151,15 @@ def _adjust_thinned(
     adjustment: pycolmap.BundleAdjustmentOptions,
 ) -> None:
     """Adjust cameras, poses and the tracks there are until little changes; then bring back all matches, and adjust all
-    of it in a few steps: the long tracks have put everything in its place by then."""
+    of it in a few iterations: the long tracks have put everything in its place by then."""
     bundle_adjust(model, constant_cameras, adjustment)
     mapper, options = _mapper(model, database, seed, constant_cameras)
     for image_id in sorted(model.reg_image_ids()):
         mapper.triangulate_image(options.triangulation, image_id)
-    for steps in CLOSING_STEPS:
+    for iterations in FINAL_ITERATIONS:
         mapper.complete_and_merge_tracks(options.triangulation)
         mapper.filter_points(options.mapper)
-        bundle_adjust(model, constant_cameras, adjustment, steps)
+        bundle_adjust(model, constant_cameras, adjustment, iterations)
     mapper.filter_points(options.mapper)
     mapper.end_reconstruction(discard=False)
     model.update_point_3d_errors()
@@ -231,7 +232,7 @@ def bundle_adjust(
     model: pycolmap.Reconstruction,
     constant_cameras: set[int],
     adjustment: pycolmap.BundleAdjustmentOptions,
-    steps: int = 100,
+    iterations: int = 100,
     constant_poses: bool = False,
 ) -> None:
     """Adjust cameras, poses and points to the observations that the model has."""
@@ -244,7 +245,7 @@ def bundle_adjust(
         config.set_constant_cam_intrinsics(camera_id)
     if not constant_poses:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjustment.ceres.solver_options.max_num_iterations = steps
+    adjustment.ceres.solver_options.max_num_iterations = iterations
     pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
 
 

@@ -48,10 +48,10 @@ def order_is_informative(order: Int[np.ndarray, "photos"], inliers: Int[np.ndarr
 
     In a shuffled set they share what any two photos do, and trying more of them is useless.
     """
-    beside = inliers[order[:-1], order[1:]]
+    consecutive = inliers[order[:-1], order[1:]]
     tested = np.where(inliers < 0, 0, inliers)
     tested[order[:-1], order[1:]] = tested[order[1:], order[:-1]] = 0
-    return bool(np.median(beside) >= np.median(tested.max(axis=1)) / 2) if len(order) > 1 else False
+    return bool(np.median(consecutive) >= np.median(tested.max(axis=1)) / 2) if len(order) > 1 else False
 
 
 def next_pairs(inliers: Int[np.ndarray, "photos photos"], similarity: SimilarityMatrix, neighbours: int) -> Pairs:

@@ -128,7 +128,7 @@ def start_pairs(
     return union(sequential(order, overlap), nearest(np.where(apart, similarity(), -np.inf), loops))
 
 
-def second_look(
+def with_more_pairs(
     pairs: Pairs, missing: Sequence[int], neighbours: int, similarity: Callable[[], SimilarityMatrix]
 ) -> Pairs:
     """The pairs again, and more for unregistered photos: as many as were matched already, at most all.

@@ -34,8 +34,9 @@ MICRO_BATCH_SAMPLES = {"bounded": 3 << 13, "contracted": 1 << 14, "ndc": 1 << 14
 # (docs/experiments/colour_samples.md).
 MAX_STEP_SAMPLES, LARGE_STEP_LEARNING_RATE = 1 << 18, 2e-2
 # Weight of the distortion loss (Barron et al. 2022, who take 1e-2 where distances go from 0 to 1, as about they do in
-# normalised device coordinates), against fog and matter close before the cameras; fog also costs most of the time
-# (docs/experiments/distortion_loss.md, docs/experiments/forward_facing.md). A box around an object needs none.
+# normalised device coordinates), against floaters, most of all close before the cameras; they also cost
+# most of the time (docs/experiments/distortion_loss.md, docs/experiments/forward_facing.md). A box around an object
+# needs none.
 DISTORTION = {"bounded": 0.0, "contracted": 2e-3, "ndc": 1e-2}
 # Weight at first of the loss at sparse points (docs/experiments/sparse_depth.md; Deng et al. 2022 take 0.1, too, of
 # another loss).
@@ -164,7 +165,7 @@ def work(config: Config, rays: float) -> str:
 
 def memory_bytes(config: Config, workers: int) -> float:
     """Memory on the CPU that training takes beside the photos, so many chunks of work at a time."""
-    settings = field_settings(config, sky=False)  # which is small beside the rest
+    settings = field_settings(config, background_model=False)  # which is small beside the rest
     assert config.grid.target_samples, "plan() chooses it"
     table = TABLE_COPIES * 4 * settings.features_per_level * settings.layout.rows
     return table + SAMPLE_BYTES * config.grid.target_samples
@@ -183,7 +184,7 @@ def matmul_width(config: Config) -> int:
 
 def table_rows(config: Config) -> int:
     """Rows of features that are read at random."""
-    return field_settings(config, sky=False).layout.rows
+    return field_settings(config, background_model=False).layout.rows
 
 
 def sizes_in_words(config: Config) -> str:
@@ -195,7 +196,7 @@ def sizes_in_words(config: Config) -> str:
 def step_in_words(config: Config) -> str:
     """How a step is divided and what computes it, and where samples stand along a ray."""
     grid = config.grid
-    stepping = field_settings(config, sky=False).stepping
+    stepping = field_settings(config, background_model=False).stepping
     cone = f", from {stepping.linear_until:g} on every {stepping.cone_angle:.1%} of the distance"
     growing = cone if stepping.cone_angle else ""
     if config.space == "ndc":
@@ -218,7 +219,7 @@ def make_trainer(
     return HashGridTrainer(model, dataset, _trainer_settings(config, scene, seed), effects)
 
 
-def field_settings(config: Config, sky: bool, space: SpaceMap | None = None) -> HashGridSettings:
+def field_settings(config: Config, background_model: bool, space: SpaceMap | None = None) -> HashGridSettings:
     """Sizes of the field. Samples stand as close as the finest cells can tell them apart: in contracted space a third
     to two thirds of a cell near the camera, growing with the distance, as pixels do; in a box a cell, or MAX_STEPS in
     all. Sizes and steps alone need no ``space`` of a scene."""
@@ -239,7 +240,7 @@ def field_settings(config: Config, sky: bool, space: SpaceMap | None = None) -> 
         cone_angle=shortest / EVEN_UNTIL,
         max_samples_per_ray=math.ceil(MAX_SAMPLES * max(1.0, grid.ray_samples)),
         view_dependence=config.view_dependence,
-        background_model=sky,
+        background_model=background_model,
     )
 
 

@@ -40,11 +40,15 @@ def trial(inputs: dict[str, Path]) -> Iterator[PilotScene]:
         yield made
 
 
-def test_photos_are_kept_back_from_the_training_photos_alone(trial: PilotScene, inputs: dict[str, Path]) -> None:
+def test_validation_photos_are_taken_from_the_training_photos_alone(trial: PilotScene, inputs: dict[str, Path]) -> None:
     given = read_scene(inputs["normalise"])
-    trained, kept = ({view.name for view in trial.scene.of_split(split)} for split in ("train", "validation"))
-    assert kept and trained | kept == {view.name for view in given.of_split("train")} and not trained & kept
-    assert len(trial.kept) == len(kept) and len(trial.dataset.near) == len(trained)
+    trained, validation = ({view.name for view in trial.scene.of_split(split)} for split in ("train", "validation"))
+    assert (
+        validation
+        and trained | validation == {view.name for view in given.of_split("train")}
+        and not trained & validation
+    )
+    assert len(trial.validation) == len(validation) and len(trial.dataset.near) == len(trained)
 
 
 def test_equal_arms_gain_exactly_nothing(trial: PilotScene) -> None:
@@ -79,7 +83,7 @@ def test_validation_poses_are_fitted_wherever_poses_are_refined(
     monkeypatch.setattr(ab_runs, "_trained", lambda *_: None)
     monkeypatch.setattr(ab_runs, "_score", score)
     run_pilot(trial, off, on, 1, 0, SilentDisplay())
-    assert asked == [fitted] * (2 * ab_runs.SEEDS * len(trial.kept))
+    assert asked == [fitted] * (2 * ab_runs.SEEDS * len(trial.validation))
 
 
 @pytest.mark.parametrize(
@@ -96,17 +100,17 @@ def test_validation_poses_are_fitted_wherever_poses_are_refined(
 def test_a_pilot_ends_when_no_change_is_to_come(
     trial: PilotScene, monkeypatch: pytest.MonkeyPatch, default: bool | None, gains: tuple[float, ...], pairs: int
 ) -> None:
-    arms = list[tuple[str, int]]()
+    runs = list[tuple[str, int]]()
 
-    def trained(_trial: object, arm: Decisions, steps: int, seed: int) -> tuple[str, int]:
+    def trained(_trial: object, decisions: Decisions, steps: int, seed: int) -> tuple[str, int]:
         if steps > 1:  # not the warm-up
-            arms.append(("on" if "exposure" in arm.on else "off", seed))
-        return ("on" if "exposure" in arm.on else "off", seed)
+            runs.append(("on" if "exposure" in decisions.on else "off", seed))
+        return ("on" if "exposure" in decisions.on else "off", seed)
 
     monkeypatch.setattr(ab_runs, "_trained", trained)
-    monkeypatch.setattr(ab_runs, "_score", lambda arm, *_: 20 + (gains[arm[1]] if arm[0] == "on" else 0))
+    monkeypatch.setattr(ab_runs, "_score", lambda run, *_: 20 + (gains[run[1]] if run[0] == "on" else 0))
     pilot = run_pilot(trial, PLAIN, PLAIN.having("exposure"), 2, 0, SilentDisplay(), default)
-    assert sorted(arms) == sorted((arm, seed) for arm in ("on", "off") for seed in range(pairs))
+    assert sorted(runs) == sorted((run, seed) for run in ("on", "off") for seed in range(pairs))
     assert pilot.gain_db == pytest.approx(np.mean(gains[:pairs])) and pilot.seeds == pairs
     assert (pilot.pays, pilot.hurts) == (pairs == 3 and default is False, pairs == 3 and default is True)
 
@@ -123,11 +127,11 @@ def test_an_ended_pilot_would_have_proved_little() -> None:
 def test_a_validation_image_is_rendered_thinly(
     inputs: dict[str, Path], trial: PilotScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert trial.kept[0].colours.shape == (45, 60, 3), "a small one whole"
+    assert trial.validation[0].colours.shape == (45, 60, 3), "a small one whole"
     monkeypatch.setattr(ab_runs, "LONG_SIDE", 200)
     large = pilot_scene(inputs, read_scene(inputs["normalise"]), SilentDisplay())
     assert isinstance(large, PilotScene)
-    photo = large.kept[0]
+    photo = large.validation[0]
     assert max(photo.colours.shape[:2]) == ab_runs.SCORED_SIDE and photo.rays.near.shape == photo.colours.shape[:2]
 
 
@@ -153,7 +157,7 @@ def test_too_few_photos_make_no_pilot(tmp_path: Path) -> None:
         inputs, scene = photographed(tmp_path / str(views), views=views)
         made[len(scene.of_split("train"))] = pilot_scene(inputs, scene, SilentDisplay())
     assert made[3] == made[6] == "too few training photos"
-    assert isinstance(made[7], PilotScene) and len(made[7].kept) == 3
+    assert isinstance(made[7], PilotScene) and len(made[7].validation) == 3
 
 
 @pytest.mark.parametrize(
@@ -197,7 +201,7 @@ def test_an_effect_that_gains_nothing_rarely_pays() -> None:
 
 
 def test_a_photos_pose_is_found_against_a_finished_field(trial: PilotScene) -> None:
-    field, photo = ab_runs._trained(trial, PLAIN, 150, 0).field, trial.kept[0]
+    field, photo = ab_runs._trained(trial, PLAIN, 150, 0).field, trial.validation[0]
     rays = type(photo.rays)(*(part.flatten(0, 1) for part in photo.rays))
     black, view = torch.zeros(3), torch.zeros(len(rays.near), dtype=torch.int64)
     target = render_image(field, photo.rays, black).colour.flatten(0, 1)

@@ -37,7 +37,7 @@ def found(called_for: bool | None, noise: float = 0.1) -> Statistic:
 
 @pytest.fixture
 def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Decisions, dict, str, list[str]]]:
-    """Runs the stage on given evidence; the pilots' arms are noted, and gain ``gain`` ± 0.2 dB."""
+    """Runs the stage on given evidence; both runs of each pilot are noted, and gain ``gain`` ± 0.2 dB."""
     inputs, scene = photographed(tmp_path / "scene", views=11, bounded=False)
     inputs["sfm"] = tmp_path / "scene" / "sfm"
     inputs["sfm"].mkdir()

@@ -21,7 +21,7 @@ from stages.train.data import (
     MAX_PATCHES,
     PhotoReader,
     camera_directions,
-    guided_dataset,
+    dataset_with_depths,
     patch_directions,
     scaled_size,
     training_dataset,
@@ -244,7 +244,7 @@ def test_the_bank_knows_where_training_photos_show_points(
     downscale: float, tmp_path: Path, progress: RecordedProgress
 ) -> None:
     inputs, scene = photographed(tmp_path)
-    dataset = guided_dataset(inputs, scene, downscale, progress)
+    dataset = dataset_with_depths(inputs, scene, downscale, progress)
     assert dataset.sparse_pixels is not None and dataset.sparse_depths is not None
     seen = seen_points(scene)
     trained = np.array([view.split == "train" for view in scene.views])[seen["view"]]
@@ -266,14 +266,14 @@ def test_depth_maps_are_those_of_the_training_photos(tmp_path: Path, progress: R
             path.parent.mkdir(exist_ok=True)
             distance = np.full((2, 3), (view.near + view.far) / 2 + number / 1e3, np.float32)
             write_depth_map(path, DepthMap(distance, distance / 100, np.full((2, 3), 2, np.uint8)))
-    dataset = guided_dataset(inputs, scene, 2.0, progress, tmp_path)
+    dataset = dataset_with_depths(inputs, scene, 2.0, progress, tmp_path)
     pixel = dataset.first_pixel[:-1] + 1
     expected = [
         (view.near + view.far) / 2 + number / 1e3 for number, view in enumerate(scene.views) if view.split == "train"
     ]
     assert len(expected) > 1
     torch.testing.assert_close(dataset.depths(pixel, torch.arange(len(pixel))), torch.tensor(expected))
-    assert guided_dataset(inputs, scene, 2.0, progress).depth_maps is None
+    assert dataset_with_depths(inputs, scene, 2.0, progress).depth_maps is None
 
 
 def test_points_guide_once_two_training_photos_saw_them(tmp_path: Path, progress: RecordedProgress) -> None:
@@ -286,13 +286,15 @@ def test_points_guide_once_two_training_photos_saw_them(tmp_path: Path, progress
     for count, known in {len(rows) - 1: 0, len(rows): 2}.items():
         some = {name: seen[name][rows[:count]] if name in ("view", "point", "xy") else seen[name] for name in seen}
         write_tensors(inputs["normalise"] / "points.safetensors", some)
-        dataset = guided_dataset(inputs, scene, 1.0, progress)
+        dataset = dataset_with_depths(inputs, scene, 1.0, progress)
         assert (0 if dataset.sparse_pixels is None else len(dataset.sparse_pixels)) == known
 
 
 def test_points_on_the_rim_of_alpha_are_no_guide(tmp_path: Path, progress: RecordedProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=4)
-    dataset, opaque = (guided_dataset(inputs, each, 1.0, progress) for each in (scene, replace(scene, has_alpha=False)))
+    dataset, opaque = (
+        dataset_with_depths(inputs, each, 1.0, progress) for each in (scene, replace(scene, has_alpha=False))
+    )
     assert dataset.sparse_pixels is not None and opaque.sparse_pixels is not None
     assert (dataset.pixels[dataset.sparse_pixels, 3] == 255).all()
     assert 0 < len(dataset.sparse_pixels) < len(opaque.sparse_pixels)
@@ -302,5 +304,5 @@ def test_points_on_masked_pixels_are_no_guide(tmp_path: Path, progress: Recorded
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, WIDTH // 2 :] = 0
     inputs, scene = photographed(tmp_path, mask=mask)
-    known = guided_dataset(inputs, scene, 1.0, progress).sparse_pixels
+    known = dataset_with_depths(inputs, scene, 1.0, progress).sparse_pixels
     assert known is not None and (known % WIDTH < WIDTH // 2).all()

@@ -144,7 +144,7 @@ def test_grids_grow_with_rays_and_pixels(
 
     small, more_rays, fewer_pixels = chosen(rays, down), chosen(rays * factor, down), chosen(rays, down * factor)
     assert all(more_rays[name] >= small[name] >= fewer_pixels[name] for name in small)
-    field = field_settings(with_grid(config, **small), sky=False)
+    field = field_settings(with_grid(config, **small), background_model=False)
     assert isinstance(field, HashGridSettings)
     assert 128 <= field.max_res <= 1024
     # Two neighbouring samples lie in the same or in neighbouring cells of the finest grid, near the cameras at least.
@@ -195,7 +195,7 @@ def test_samples_follow_occupied_cells() -> None:
         space="contracted", view_dependence=True, grid=HashGridOptions(num_levels=1, log2_hashmap_size=8)
     )
     sizes = (with_grid(contracted, max_res=max_res) for max_res in (256, 512, 700, 1024, 2048, 4096))
-    fields = [field_settings(config, sky=False) for config in sizes]
+    fields = [field_settings(config, background_model=False) for config in sizes]
     steps = [field.min_step_size for field in fields]
     assert steps == [4 / 768, 4 / 1536, 4 / 1536, 4 / 1536, 4 / 3072, 4 / 3072]
     assert all(field.cone_angle == field.min_step_size / 0.25 for field in fields)
@@ -206,8 +206,8 @@ def test_samples_follow_occupied_cells() -> None:
 def test_ray_samples_multiply_the_samples_along_a_ray(space: Space, factor: float) -> None:
     config = with_grid(GRID, num_levels=4, log2_hashmap_size=16, max_res=512)
     config = config.model_copy(update={"space": space})
-    usual = field_settings(config, sky=False)
-    asked = field_settings(with_grid(config, ray_samples=factor), sky=False)
+    usual = field_settings(config, background_model=False)
+    asked = field_settings(with_grid(config, ray_samples=factor), background_model=False)
     assert asked.diagonal_steps == pytest.approx(factor * usual.diagonal_steps, abs=0.5)
     assert asked.cone_angle == pytest.approx(usual.cone_angle / factor)
     rounding = 0.5 / min(asked.diagonal_steps, usual.diagonal_steps)

@@ -202,4 +202,7 @@ def test_hash_grid_rates_are_at_its_table_size() -> None:
     grid = HashGridOptions(num_levels=2, log2_hashmap_size=8, max_res=64)
     config = Config(grid=grid, space="bounded", view_dependence=True)
     rows = field_of(config).table_rows(config)
-    assert (field_of(config).matmul_width(config), rows) == (64, field_settings(config, sky=False).layout.rows)
+    assert (field_of(config).matmul_width(config), rows) == (
+        64,
+        field_settings(config, background_model=False).layout.rows,
+    )

@@ -13,11 +13,11 @@ from stages.sfm.pairs.pair_selection import (
     closeness,
     exhaustive,
     nearest,
-    second_look,
     sequential,
     spanning_tree,
     start_pairs,
     union,
+    with_more_pairs,
 )
 
 
@@ -173,13 +173,13 @@ def test_where_positions_tell_nothing_looks_choose_half_of_the_partners(error_m:
 def test_a_second_selection_doubles_the_pairs_of_missing() -> None:
     alike = similarity(40)
     pairs = nearest(alike, 4)
-    again = second_look(pairs, [3, 17], 4, lambda: alike)
+    again = with_more_pairs(pairs, [3, 17], 4, lambda: alike)
     assert {*map(tuple, pairs.tolist())} < {*map(tuple, again.tolist())}
     assert all(3 in pair or 17 in pair for pair in {*map(tuple, again.tolist())} - {*map(tuple, pairs.tolist())})
     assert partners(again, 40)[3] == set(range(40)) - {3}  # each may have half of more than 80 pairs
-    everyone = second_look(pairs, list(range(40)), 4, lambda: alike)
+    everyone = with_more_pairs(pairs, list(range(40)), 4, lambda: alike)
     assert min(map(len, partners(everyone, 40))) >= 8
-    np.testing.assert_array_equal(second_look(exhaustive(9), [2], 4, unused), exhaustive(9))
+    np.testing.assert_array_equal(with_more_pairs(exhaustive(9), [2], 4, unused), exhaustive(9))
 
 
 def test_pairs_are_chosen_of_sets_above_ordinary_size() -> None:
