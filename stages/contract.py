@@ -8,22 +8,25 @@ A stage is a package in this folder and one line in pipeline/engine/stage_list.p
 * ``RESUMES: bool``: whether it can go on from its own half-written folder (otherwise it starts clean);
 * ``PUBLISHED: tuple[str, ...]``: the outputs or records shown in ``<workspace>/output/``;
 * ``Config``: its settings, a :class:`StageConfig`;
-* ``run(config, inputs, folder, progress) -> StageResult``: reads ``inputs[stage]`` (finished folders), writes
-  into ``folder`` and nowhere else, raises :class:`StageError` for everything a user can act on. ``config`` is planned;
+* ``run(config, inputs, folder, progress) -> StageResult``: reads ``inputs[stage]`` (finished folders), writes its
+  results into ``folder`` alone, raises :class:`StageError` for everything a user can act on. ``config`` is planned. Two
+  exceptions: ``--more`` reads the finished training that it continues, which is no input, from the same workspace
+  (stages/train/more.py), and pixel stores, a cache, lie beside ingest's folder (stages/io/pixel_store.py);
 
 and may have (:data:`DEFAULTS` hold otherwise)
 
-* ``OPTIONAL_INPUTS: tuple[str, ...]``: stages whose finished folders it reads where they are there: they are no part of
-  its key and are not brought up to date for it, nor given to it where damaged, so no output may depend on them;
-* ``more_inputs(config) -> tuple[str, ...]``: the stages that it reads beside its ``INPUTS`` because its options ask for
-  it (:func:`inputs_of`);
-* ``DISPENSABLE: tuple[str, ...]``: those of its inputs without which it works as well: where one of these has no result
-  the stage goes without, under another key. A run goes on when a stage fails that all later ones can go without;
+* ``more_inputs(config) -> tuple[str, ...]``: further inputs that its options ask for, treated as ``INPUTS`` are: they
+  run first and enter the key (:func:`inputs_of`);
+* ``DISPENSABLE: tuple[str, ...]``: those of its inputs that may fail. Without the result of one the stage runs all the
+  same, under another key; a run goes on when a stage fails that all later ones can do without;
+* ``OPTIONAL_INPUTS: tuple[str, ...]``: stages whose finished folders it reads if they happen to be there. They do not
+  run for it, do not enter its key, and are withheld where damaged: no output may depend on them;
 * ``NOT_HASHED: tuple[str, ...]``: options that cannot change the result and so do not enter the key;
 * ``plan(config, inputs, progress) -> Config``: replaces every ``None`` ("choose for me") by a value, where it must by
   timing a piece of the work. :func:`plan_stage` calls it, once, before the stage's first run; the answer is kept in
   run.json and enters the stage's key, so a run that was killed continues with the same choice;
-* ``ON_REQUEST: bool``: nothing needs it, so it runs only where it is named, and no budget pays for it;
+* ``ON_REQUEST: bool``: it runs only where it is named, or where an option of another stage asks for it
+  (``more_inputs``), and no budget pays for it;
 * ``SUMMARY: bool``: it shows the whole run: of its ``INPUTS`` it takes what is there, with records and timings, and the
   account of a budget; it is brought up to date after whichever stage was run alone;
 * ``expected_seconds(config, workload) -> float | None``: what it takes without a budget; None where nobody can tell;
@@ -32,7 +35,7 @@ and may have (:data:`DEFAULTS` hold otherwise)
 * ``limiting_seconds(options) -> float | None``: for a stage whose ``seconds`` have a limit without a budget as well:
   what that limit follows from, None for no limit.
 
-Importing a stage must be cheap: torch, pycolmap, kornia and their like are imported inside ``run``.
+Importing a stage must be cheap: torch, pycolmap, kornia and their like are imported inside ``plan`` and ``run``.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""What stands between a radiance field and an image of it: optional effects, each on only where a scene calls for it.
+"""What stands between a radiance field and an image of it: optional effects, switched by stage effects.
 
 An image has a tuple of ray effects (its camera model: where its rays run) and a tuple of colour effects (its appearance
 model: what it shows of the scene), applied in order. :class:`ImageEffects` holds both and composes them; without any it

@@ -9,7 +9,8 @@ is c + (k - 1) (c + 0.055). That keeps colours as large as 1e30 finite, and c ex
 
 Gains begin as the tracks measured them (nerf/effects/statistics/exposure.py) and are learnt on with the field, which
 holds what the darkest photo shows: its colours end at 1, and only the photo with the least gain shows all that is
-bright. So gains are kept as they are above the least one of each channel, which stands for one.
+bright. So the least gain of each channel begins at one. From then on the mean of the logarithms is held, which fixes
+the gauge.
 """
 
 import math

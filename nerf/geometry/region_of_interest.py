@@ -50,7 +50,8 @@ def focus(scene: Reconstruction) -> Float[np.ndarray, "3"]:
 
 
 def find_capture_type(scene: Reconstruction) -> CaptureType:
-    """forward: the axes are nearly parallel; around: they meet in front of the cameras; inside: neither."""
+    """Forward-facing: the axes are nearly parallel; object-centric: they meet in front of the cameras; inside-out:
+    neither."""
     middle = spatial_median(scene.axes)
     length = np.linalg.norm(middle)
     if length > 0 and np.quantile(angles_deg(scene.axes, middle / length), 0.8) <= FORWARD_DEG:

@@ -11,8 +11,9 @@ torch, any device, float32 or float64. The contract:
   the results and returns, or adds to, the one with respect to the arguments. Sample distances carry no gradient.
 * Samples are *packed*: those of ray r are the entries starts[r] ... starts[r + 1] - 1, front to back. A ray may have
   none.
-* Points given to the hash grid or the occupancy grid are in *unit coordinates*: [0, 1]^3 is the cube [-0.9, 0.9]^3 of a
-  bounded scene, or the contracted space [-2, 2]^3 (nerf/geometry/space_maps/contraction.py).
+* Points given to the hash grid or the occupancy grid are in *unit coordinates*: [0, 1]^3 is the cube of the scene's
+  space map (nerf/geometry/space_maps): [-0.9, 0.9]^3 of a bounded scene or of normalised device coordinates, or the
+  contracted space [-2, 2]^3.
 * No function draws random numbers; no function fails on zero rays or zero samples.
 """
 

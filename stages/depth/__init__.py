@@ -1,7 +1,7 @@
 """Stage depth: a depth map for every training photo, and a dense point cloud, by stereo alone, without any training.
 
 Pairs of photos → rectified → disparities by semi-global matching → per photo the distances that several neighbours
-agree on → points. Test photos are not looked at, so what is made of the depth maps learns nothing of them.
+agree on → points. Test photos are not used, so a field that is trained with the depth maps still sees nothing of them.
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ ON_REQUEST = True
 PUBLISHED = ("points.ply",)
 NOT_HASHED = ("seconds",)  # it decides the size of the depth maps, and that enters the key
 
-PAIRS_PER_PHOTO = 2.5  # of four neighbours each, most of them chosen by both
+PAIRS_PER_PHOTO = 2.5  # with four neighbours each: most pairs are chosen from both sides, and matched once
 PAIR_SECONDS, PHOTO_SECONDS = 0.35, 0.5  # of a core, at the default size
 
 

@@ -1,4 +1,8 @@
-"""Stage effects: which optional effects the scene calls for, with the evidence; the others are not simulated at all."""
+"""Stage effects: which optional effects are modelled, with the evidence; the others are not simulated at all.
+
+An effect is on only where the photos call for it. View dependence, which the published method has, is on unless an A/B
+run shows that it does harm.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -85,8 +89,8 @@ def budget_seconds(left: BudgetLeft) -> float:
 
 
 def limiting_seconds(options: Mapping[str, Any]) -> float | None:
-    """Without a budget a training in seconds limits its pilots; a run that counts steps is to end the same on every
-    machine. What ``--more`` adds changes no pilot: the field that goes on stands on their decisions."""
+    """Without a budget a training in seconds limits its pilots; a run that counts steps must not depend on how fast the
+    machine is. What ``--more`` adds changes no pilot: the continued field stands on their decisions."""
     return options["train"].planned_seconds
 
 

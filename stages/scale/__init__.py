@@ -1,6 +1,7 @@
 """Stage scale: how many metres a unit of the sfm frame is, by markers in the photos, a distance, or GPS.
 
-A stage of its own: a length that becomes known after training changes the files in metres, and trains nothing again.
+It is a stage of its own, so that a length given after training changes only the files in metres; nothing is trained
+again.
 """
 
 from pathlib import Path
@@ -62,7 +63,9 @@ def metres_per_unit(folder: Path) -> float | None:
 
 def expected_seconds(config: Config, workload: Workload) -> float:
     """Next to nothing without markers; with them the photos are decoded and searched."""
-    return 0.3 + bool(config.marker) * 3 * workload.photos.reading_seconds(workload.cores)
+    if not config.marker:
+        return 0.3
+    return 0.3 + 3 * workload.photos.reading_seconds(workload.cores)
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:

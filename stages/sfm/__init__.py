@@ -23,9 +23,9 @@ VERSION = 29
 EXIT_CODE = 11
 RESUMES = True
 PUBLISHED = ("sparse", "registration.json")
-# Both may decide that a retry strategy is skipped, which is said, in the stage's line as well. A run with another limit
-# is to resume from the matches that one before it kept, so its key has to be the same. The quality of feature
-# extraction, which ``seconds`` decides as well, enters the key by options of its own.
+# Both may make the stage skip a retry strategy; its line then says so. They stay out of the key, so that a run with
+# another limit finds the matches of the one before it and resumes from them. ``seconds`` also sets the quality of
+# feature extraction, which enters the key by options of its own (max_image_size, max_features).
 NOT_HASHED = ("max_seconds", "seconds")
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
@@ -148,12 +148,13 @@ def expected_seconds(config: Config, workload: Workload) -> float:
 
 
 def budget_seconds(left: BudgetLeft) -> float:
-    """It cannot be planned to the second, so it comes first of all that the rest is fitted around."""
+    """At most half of the budget, and less where later stages need their minimum. Its time cannot be planned to the
+    second, so later stages adapt to what it leaves."""
     return max(1.0, min(BUDGET_SHARE * left.total, left.free - left.reserved))
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
-    """The config with features and pairs chosen, by what they take on this machine for some of the photos."""
+    """Choose image size, number of features and matcher: by the time that some of the photos take on this machine."""
     if config.cameras is not None or None not in (config.max_image_size, config.max_features, config.matcher):
         return config
     from stages.sfm import reconstruction

@@ -41,7 +41,8 @@ class Config(StageConfig):
         default=None,
         ge=1,
         description=(
-            "Number of training steps; on a CPU the result is the same every time (default: train for --train.seconds)."
+            "Number of training steps; on one CPU, with as many cores, the result is the same every time (default: "
+            "train for --train.seconds)."
         ),
     )
     preset: Auto[Literal["draft", "standard", "high", "paper"]] = Field(

@@ -33,15 +33,15 @@ def visible_samples(
     """The samples that are worth a colour, and their numbers among all.
 
     These lie in the front part of their ray, before which the transmittance is still ``threshold`` or more; 0 keeps
-    everything. ``sigma`` must be the density that will be composited: older ones (the cache's) would hide a surface
-    from the very gradient that is to move it.
+    everything. ``sigma`` must be the density that will be composited: older ones (the occupancy grid's) would hide a
+    surface from the very gradient that is to move it.
 
-    Of those thinner than ``thinning_threshold`` each is kept with probability p = max(tau / thin,
+    Of those with tau below ``thinning_threshold`` each is kept with probability p = max(tau / thinning_threshold,
     MIN_KEEP_PROBABILITY), and its interval is made 1 / p times as long: it stands for others like it, so that sums of
     tau f over a ray keep their expectation, and so do gradients of densities. Probabilities are added up along the ray,
     beginning with ``thinning_offset``, a random number in [0, 1), and a sample is kept where the sum reaches a whole
-    number (systematic sampling; Carpenter et al. 1999), so that thin fog is sampled evenly. ``thinning_threshold`` 0
-    keeps all.
+    number (systematic sampling; Carpenter et al. 1999), so that long stretches of little density are sampled evenly.
+    ``thinning_threshold`` 0 keeps all.
     """
     probability = _keep_probability(sigma * samples.dt, thinning_threshold)
     of_thin = torch.where(probability < 1, probability, 0).double()
