@@ -90,8 +90,11 @@ def georeference(
     width = _across(centres)
     if _across(enu) < GPS_ERROR_M / 2 or not width * np.sqrt(len(centres)) > MIN_WIDTH * np.abs(centres).max():
         return ONE_LINE
-    fitted, kept = _robust(centres, enu)
-    if fitted.scale * width < GPS_ERROR_M / 2:
+    try:
+        fitted, kept = _robust(centres, enu)
+    except ValueError:  # the outliers alone lay beside the line
+        return ONE_LINE
+    if min(fitted.scale * width, _across(enu[kept])) < GPS_ERROR_M / 2:
         return ONE_LINE
     off = np.linalg.norm(fitted.points(centres) - enu, axis=1)
     error = float(np.median(off[kept]))
@@ -108,6 +111,7 @@ def _across(points: Float[np.ndarray, "n 3"]) -> float:
 def _robust(
     centres: Float[np.ndarray, "n 3"], enu: Float[np.ndarray, "n 3"]
 ) -> tuple[Similarity, Bool[np.ndarray, "n"]]:
+    """The similarity without outliers, and who is none. Raises ValueError where these lie on one line."""
     kept = np.ones(len(centres), bool)
     for _ in range(MAX_TRIMMING_ROUNDS):
         fitted = align(centres[kept], enu[kept])

@@ -84,6 +84,22 @@ def test_noise_across_a_straight_walk_tells_no_direction(seed: int) -> None:
     assert georeference(SFM_FROM_ENU.points(winding), places(told)) == ONE_LINE
 
 
+def test_positions_on_a_line_but_for_outliers_tell_no_direction() -> None:
+    """A phone that stands still, is moved once, and has one stale position."""
+    told = np.zeros((60, 3))
+    told[40:59, 0], told[59, 1] = 15.0, 300.0
+    known = [(north, east, None) for north, east, _ in places(told)]
+    assert georeference(np.random.default_rng(0).normal(size=(60, 3)), known) == ONE_LINE
+
+
+def test_positions_drawn_to_a_road_tell_no_direction() -> None:
+    random = np.random.default_rng(0)
+    walk = np.linspace(0, 100, 40)[:, None] * [1.0, 0, 0] + random.normal(0, 8, (40, 3)) * [0, 1, 0]
+    told = walk * [1, 0, 0] + random.normal(0, 1, (40, 3)) * [1, 1, 0]
+    told[7, 1] = 300.0
+    assert georeference(SFM_FROM_ENU.points(walk), places(told)) == ONE_LINE
+
+
 def test_gps_unrelated_to_the_photos_is_refused() -> None:
     told = np.random.default_rng(1).normal(0, 60, (12, 3))
     why = georeference(SFM_FROM_ENU.points(walked()), places(told))
