@@ -64,12 +64,13 @@ def next_pairs(inliers: Int[np.ndarray, "photos photos"], similarity: Similarity
     allowed = np.clip(neighbours - tested, 0, MAX_NEW_PARTNERS)
     overlap = np.where(inliers == UNTESTED, neighbour_overlap(inliers), -np.inf)
     np.fill_diagonal(overlap, -np.inf)
-    by_overlap = _best_partners(np.where(overlap >= MIN_OVERLAP, overlap, -np.inf), allowed)
+    every = np.arange(len(inliers))
+    by_overlap = _best_partners(every, np.where(overlap >= MIN_OVERLAP, overlap, -np.inf), allowed)
     links = (inliers >= MIN_INLIERS).sum(axis=1)
     few_links = np.where(links < MAX_NEW_PARTNERS, MAX_NEW_PARTNERS, 0)
     untested = np.where(inliers == UNTESTED, similarity.astype(float), -np.inf)
     np.fill_diagonal(untested, -np.inf)
-    return union(by_overlap, _best_partners(untested, few_links), across_weak_cuts(inliers, untested))
+    return union(by_overlap, _best_partners(every, untested, few_links), across_weak_cuts(inliers, untested))
 
 
 def neighbour_overlap(inliers: Int[np.ndarray, "photos photos"]) -> Float[np.ndarray, "photos photos"]:
@@ -80,13 +81,15 @@ def neighbour_overlap(inliers: Int[np.ndarray, "photos photos"]) -> Float[np.nda
     return weight @ weight.T / (length[:, None] * length[None])
 
 
-def _best_partners(score: Float[np.ndarray, "photos photos"], each: Int[np.ndarray, "photos"]) -> Pairs:
-    """Of each photo its best partners, as many as it may have; none whose score is minus infinity."""
+def _best_partners(
+    photos: Int[np.ndarray, "some"], score: Float[np.ndarray, "some photos"], each: Int[np.ndarray, "some"]
+) -> Pairs:
+    """Of each of some photos its best partners, as many as it may have; none whose score is minus infinity."""
     order = np.argsort(-score, axis=1, kind="stable")
-    rank = np.arange(len(score))[None] < each[:, None]
+    rank = np.arange(score.shape[1])[None] < each[:, None]
     chosen = rank & np.isfinite(np.take_along_axis(score, order, axis=1))
-    first, place = np.nonzero(chosen)
-    return union(np.stack([first, order[first, place]], axis=1))
+    row, place = np.nonzero(chosen)
+    return union(np.stack([photos[row], order[row, place]], axis=1))
 
 
 # --- weak cuts
@@ -137,9 +140,9 @@ def across_weak_cuts(inliers: Int[np.ndarray, "photos photos"], untested: Float[
     found = [np.zeros((0, 2), int)]
     cuts = weak_cuts(np.where(inliers >= MIN_INLIERS, inliers, 0).astype(float))
     for side in cuts.side[cuts.edges <= MAX_WEAK_CUT_EDGES]:
-        across = np.where(side[:, None] & ~side[None], untested, -np.inf)
-        each = np.where(side, MAX_NEW_PARTNERS, 0)
-        found.append(_best_partners(across, each))
+        photos = np.flatnonzero(side)
+        across = np.where(side[None], -np.inf, untested[photos])
+        found.append(_best_partners(photos, across, np.full(len(photos), MAX_NEW_PARTNERS)))
     return union(*found)
 
 

@@ -5,8 +5,11 @@ import pytest
 
 from stages.io.photos import Photo
 from stages.sfm.pairs.match_graph import (
+    MAX_NEW_PARTNERS,
+    MAX_WEAK_CUT_EDGES,
     MIN_INLIERS,
     UNTESTED,
+    across_weak_cuts,
     candidate_orders,
     connected,
     inlier_matrix,
@@ -68,6 +71,30 @@ def test_two_parts_of_the_graph_are_tried_with_each_other() -> None:
     more = next_pairs(inlier_matrix(20, pairs, truth[pairs[:, 0], pairs[:, 1]]), similarity, neighbours=30)
     assert [3, 14] in more.tolist()
     assert ((more < 10).sum(axis=1) == 1).all()
+
+
+def test_every_photo_on_the_smaller_side_is_tried_with_its_most_similar_ones_across() -> None:
+    """Fronds of one to six photos hang by one edge each on a ring: every one of them is a weak cut."""
+    truth = walk(40, reach=2)
+    fronds = [range(40, 41), range(41, 44), range(44, 50)]
+    count = 50
+    inliers = np.full((count, count), UNTESTED)
+    inliers[:40, :40] = np.where(truth > 0, truth, UNTESTED)
+    for place, frond in enumerate(fronds):
+        inliers[np.ix_(frond, frond)] = 300
+        inliers[frond[0], 10 * place] = inliers[10 * place, frond[0]] = 100
+    untested = np.where(inliers == UNTESTED, np.rint(9 * noisy_similarity(inliers, 0.4)), -np.inf)  # with ties
+    np.fill_diagonal(untested, -np.inf)
+    found, expected = {*map(tuple, across_weak_cuts(inliers, untested).tolist())}, set()
+    cuts = weak_cuts(np.where(inliers >= MIN_INLIERS, inliers, 0).astype(float))
+    sides = cuts.side[cuts.edges <= MAX_WEAK_CUT_EDGES]
+    assert {tuple(frond) for frond in fronds} <= {tuple(np.flatnonzero(side).tolist()) for side in sides}
+    for side in sides:
+        for photo in np.flatnonzero(side).tolist():
+            across = [i for i in range(count) if not side[i] and np.isfinite(untested[photo, i])]
+            best = sorted(across, key=lambda i: -untested[photo, i])[:MAX_NEW_PARTNERS]
+            expected |= {(min(photo, i), max(photo, i)) for i in best}
+    assert found == expected and len(found) > 40
 
 
 def test_overlap_is_that_of_verified_neighbours() -> None:
