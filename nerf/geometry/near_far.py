@@ -7,6 +7,7 @@ from nerf import REGION_HALF_SIZE
 from nerf.geometry.reconstruction import Reconstruction
 
 MIN_POINTS_IN_VIEW = 10  # fewer say nothing about a photo's depth range; all photos together then do
+QUANTILES = (0.002, 0.5, 0.999)  # near, median and far distance of what a photo sees
 NEAR_MARGIN = 0.7  # bare surfaces carry no points: the nearest thing may be nearer than the nearest point
 SURE_VIEWS = 3  # photos that see a point which is no false match
 MIN_NEAR = 0.05 * REGION_HALF_SIZE  # for cameras in the region whose depths nobody knows
@@ -50,11 +51,13 @@ def _points_range(scene: Reconstruction) -> tuple[Float[np.ndarray, "n"], Float[
         return np.full(count, np.nan), np.zeros(count)
     distances = scene.distances()
     sure = scene.points[np.bincount(scene.point, minlength=len(scene.points)) >= SURE_VIEWS]
+    by_view = np.argsort(scene.view, kind="stable")
+    begins = np.searchsorted(scene.view[by_view], np.arange(count + 1))
+    of_all = np.quantile(distances, QUANTILES)
     near, far = np.empty(count), np.empty(count)
     for view in range(count):
-        seen = distances[scene.view == view]
-        seen = seen if len(seen) >= MIN_POINTS_IN_VIEW else distances
-        low, middle, high = np.quantile(seen, [0.002, 0.5, 0.999])
+        seen = distances[by_view[begins[view] : begins[view + 1]]]
+        low, middle, high = np.quantile(seen, QUANTILES) if len(seen) >= MIN_POINTS_IN_VIEW else of_all
         low = max(low, 0.05 / NEAR_MARGIN * middle)
         low, high = _widened(scene, view, sure, low, high)
         near[view], far[view] = NEAR_MARGIN * low, high

@@ -1,9 +1,12 @@
-"""What cameras that took no photo may see (near and far of the photos themselves: test_normalisation.py)."""
+"""What cameras that took no photo may see; near and far of the photos themselves: mostly in test_normalisation.py."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from nerf.geometry.near_far import MIN_NEAR, near_and_far_between_views
+from nerf.geometry.near_far import MIN_NEAR, near_and_far, near_and_far_between_views
+from tests.camera_layouts import ball, ring, seen_by
 
 PHOTOS = np.array([[0.0, 0, -2.5], [0.5, 0, -2.5], [-0.5, 0, -2.5], [0, 0, 9.0]])
 NEAR, FAR = np.array([1.0, 1.1, 1.2, 0.1]), np.array([20.0, 30.0, 25.0, 90.0])
@@ -44,3 +47,14 @@ def test_from_far_away_everything_is_within_far() -> None:
 def test_in_a_bounded_scene_the_region_is_seen_whole() -> None:
     near, far = ranges((0.0, 0, -2.5), bounded=True)
     assert near < 2.5 - 0.9 < 2.5 + 0.9 < far
+
+
+def test_the_order_of_observations_changes_nothing() -> None:
+    scene = seen_by(ring(), ball())
+    few = (scene.view != 3) | (np.cumsum(scene.view == 3) <= 9)  # too few to tell: all photos together do for it
+    scene = replace(scene, view=scene.view[few], point=scene.point[few])
+    shuffled = np.random.default_rng(0).permutation(len(scene.view))
+    other = replace(scene, view=scene.view[shuffled], point=scene.point[shuffled])
+    near, far = near_and_far(scene, bounded=False)
+    np.testing.assert_array_equal(near_and_far(other, bounded=False), (near, far))
+    assert near[3] == near_and_far(replace(scene, view=np.where(scene.view == 3, 4, scene.view)), bounded=False)[0][3]
