@@ -87,7 +87,7 @@ def reconstruct(job: Job, send: Send) -> dict[str, Any]:
     model = finished.model
     checked, left_out = _last_check(model, database, state)
     checked["doubtful"] = sorted({*checked["doubtful"], *({*best.excluded, *left_out} - {*_files(model)})})
-    if state.thinned:  # points that mapping did not have are black until then
+    if state.thinned:  # mapping leaves colours out
         model.extract_colors_for_all_images(state.images)
     left_out = best.excluded | finished.left_out | left_out
     registered = [model.image(i) for i in sorted(model.reg_image_ids())]

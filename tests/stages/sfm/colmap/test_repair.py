@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
 
 from stages.io.photos import Photo
 from stages.sfm import global_mapping
@@ -152,6 +153,32 @@ def test_mapping_of_thinned_matches_finds_the_same_cameras(tmp_path: Path) -> No
     compared = compare_models(made.model, model)
     assert compared["agree"] == PHOTOS and 0 < compared["centre"] < 0.01
     assert check_model(model, made.database, 0).check.passed.all()
+
+
+def test_points_of_thinned_matches_are_coloured_in_the_end(tmp_path: Path) -> None:
+    made, random = make(tmp_path), np.random.default_rng(0)
+    camera = made.model.camera(1)
+    for image in made.model.images.values():
+        spots = Image.fromarray(random.integers(1, 255, (9, 12, 3), dtype=np.uint8))
+        spots.resize((camera.width, camera.height)).save(tmp_path / image.name)
+
+    def mapped(coloured: bool) -> pycolmap.Reconstruction:
+        options = incremental_options(0, MappingOptions(), camera_is_known=False, thinned=not coloured)
+        options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.3  # what else thinned matches change
+        options.ba_global_max_refinements = 2
+        return map_incrementally(made.database, tmp_path, tmp_path / "models", options)[0]
+
+    def points(model: pycolmap.Reconstruction) -> bytes:
+        model.write_binary(tmp_path)
+        return (tmp_path / "points3D.bin").read_bytes()
+
+    plain, coloured = mapped(False), mapped(True)
+    assert not any(point.color.any() for point in plain.points3D.values())
+    assert all(point.color.any() for point in coloured.points3D.values())
+    for model in (plain, coloured):
+        model.extract_colors_for_all_images(tmp_path)
+    assert all(point.color.any() for point in plain.points3D.values())
+    assert points(plain) == points(coloured)
 
 
 def test_focal_lengths_are_held_while_mapping_and_then_released(tmp_path: Path) -> None:
