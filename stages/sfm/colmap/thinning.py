@@ -21,6 +21,9 @@ from stages.sfm.pairs.match_graph import inlier_matrix
 TRACKS_PER_PHOTO = 500  # of mapping: 1,000 take 1.7 times as long and move no camera by more (docs/stages/sfm.md)
 CALIBRATION_STARTS = 0.5, 2.0  # × the guess; where pairs tell the focal length, both lead to the same within 1 %
 MAX_START_RATIO = 1.1
+# COLMAP calibrates on all cores, and gives no option for it: the last digits are as the order of summation has it. A
+# focal length that is held would carry them into every number after it.
+TOLD_DIGITS = 6
 # Distortion, which calibration knows nothing of, puts it off by up to a sixth; a photo that was cropped by more.
 MAX_EXIF_RATIO = 1.3
 CELLS = 4  # of 4 × 4 parts of a photo each gives tracks in turn: those of one corner would leave the rest loose
@@ -102,7 +105,7 @@ def calibrate_focal_lengths(database: Path) -> bool:
         return False  # two views through it have no fundamental matrix
     by_short, by_long = (_calibrated(database, factor) for factor in CALIBRATION_STARTS)
     told = {
-        camera: math.sqrt(short * long)
+        camera: float(f"{math.sqrt(short * long):.{TOLD_DIGITS}g}")
         for camera, short in by_short.items()
         if (long := by_long.get(camera)) and not far_apart(short, long, MAX_START_RATIO)
     }
