@@ -74,6 +74,8 @@ class JobState:
         """Say that a phase begins. Of an interrupted run features and matches are kept, while mapping starts again."""
         if database := more.get("database"):
             self.held = keep_open(Path(database))
+        if phase == "mapping":
+            self._features = None  # nothing compares them again, and mapping needs memory
         self.timer.begin(f"{self.strategy}: {phase}", from_zero=phase == "mapping")
         self.send(phase=phase, **more)
 

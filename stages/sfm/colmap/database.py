@@ -10,7 +10,7 @@ from contextlib import suppress
 from functools import partial
 from itertools import chain, combinations, product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pycolmap
@@ -18,7 +18,7 @@ from jaxtyping import Bool
 
 from stages.hardware import cluster
 from stages.hardware.device import processors
-from stages.hardware.memory import at_once
+from stages.hardware.memory import at_once, available_bytes
 from stages.io.photos import Photo, spread
 from stages.sfm.pairs.feature_matching import IndexedFeatures, index_features, match_descriptors, match_indexed
 from stages.sfm.pairs.image_retrieval import WORDS, Words, photo_similarity, vocabulary
@@ -29,7 +29,7 @@ FOCAL_GUESS = 1.2  # focal length over the longer side where EXIF is silent: 45 
 # finds views that lie farther apart; only photos that otherwise stay unregistered are matched like that.
 STRICT_RATIO = 0.8
 RELAXED_RATIO = 0.9
-BLOCK_SIZE = 32  # pairs of photos that are committed at once (progress, resuming)
+BLOCK_SIZE = 32  # pairs of photos that are worked on and committed at once (progress, resuming)
 MAPPING_MODEL = "SIMPLE_RADIAL"  # one focal length and one distortion term hold with few matches
 FISHEYE_MODEL = "SIMPLE_RADIAL_FISHEYE"
 FISHEYE_ANGLE_DEG = 150.0
@@ -38,7 +38,9 @@ MIN_FEATURES_SHARE, COUNTED_PHOTOS = 0.25, 12
 BYTES_PER_PIXEL = 100  # 77 to 86 measured on photos of 1024 to 3200 pixels
 PHOTOS_AT_A_TIME = 2  # of a cluster's core: to make a database for them takes a twentieth of a second
 OPENINGS, PAUSE_SECONDS = 50, 0.1  # a reader holds the lock for milliseconds
-CACHED_PHOTOS = 256  # whose features are held in memory, about half a megabyte each
+# Features are held in memory for so many photos at least, and for more as long as they take no more than this share of
+# what is free. Of 4096 features indexed ones take 2.5 MB, others 0.6.
+MIN_CACHED_PHOTOS, CACHE_SHARE = 256, 0.25
 
 
 def keep_open(database: Path) -> pycolmap.Database:
@@ -253,6 +255,9 @@ def _extract_here(
         )
 
 
+Item, Result = TypeVar("Item"), TypeVar("Result")
+
+
 def match_pairs(
     database: Path,
     pairs: Pairs,
@@ -270,9 +275,9 @@ def match_pairs(
     with pycolmap.Database.open(database) as db, ThreadPoolExecutor(processors()) as pool:
         todo = _spread([(i, j) for i, j in pairs.tolist() if not db.exists_two_view_geometry(i + 1, j + 1)])
         photo = partial((features or Features()).read, db)
-        every = [todo[begin : begin + BLOCK_SIZE] for begin in range(0, len(todo), BLOCK_SIZE)]
+        every = _blocks(todo)
         blocks = ([(photo(i), photo(j)) for i, j in block] for block in every)
-        matched = cluster.fan_out(partial(_match_block, max_ratio, seed), blocks, partial(_match_here, pool))
+        matched = cluster.fan_out(partial(_match_block, max_ratio, seed), blocks, partial(_on_own_cores, pool))
         started = time.monotonic()
         for number, (block, found) in enumerate(zip(every, matched, strict=True)):
             with pycolmap.DatabaseTransaction(db):
@@ -291,6 +296,10 @@ def _spread(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     return first + [pair for pair in pairs if pair not in chosen]
 
 
+def _blocks(todo: list[Item]) -> list[list[Item]]:
+    return [todo[begin : begin + BLOCK_SIZE] for begin in range(0, len(todo), BLOCK_SIZE)]
+
+
 class _Photo(NamedTuple):
     camera: pycolmap.Camera
     keypoints: np.ndarray  # (keypoints, 2), pixels
@@ -302,25 +311,29 @@ SharedPhoto = Callable[[], _Photo]
 
 class Features:
     """Photos' features as they are compared: exactly, or with ``words`` by an inverted file, which takes a fifth of the
-    time and misses two matches in a hundred. The latest CACHED_PHOTOS are kept."""
+    time and misses two matches in a hundred. The latest photos are kept."""
 
     def __init__(self, words: Words | None = None) -> None:
-        self._words = words
-        self._photos: dict[int, SharedPhoto] = {}
+        self._words, self._room = words, CACHE_SHARE * available_bytes()
+        self._photos: dict[int, tuple[SharedPhoto, int]] = {}
+        self._bytes = 0
 
     def read(self, db: pycolmap.Database, photo: int) -> SharedPhoto:
         """Those of the photo with this number, for work anywhere."""
         if (found := self._photos.pop(photo, None)) is None:
             camera = db.read_camera(db.read_image(photo + 1).camera_id)
-            keypoints = np.array(db.read_keypoints(photo + 1), float).reshape(-1, 6)
+            keypoints = np.array(db.read_keypoints(photo + 1), float).reshape(-1, 6)[:, :2].copy()
             features: Any = read_descriptors(db, photo)
             if self._words is not None:
                 features = index_features(features, self._words)
-            found = cluster.share(_Photo(camera, keypoints[:, :2], features))
+            arrays = [features] if self._words is None else vars(features).values()
+            size = keypoints.nbytes + sum(array.nbytes for array in arrays)
+            found = cluster.share(_Photo(camera, keypoints, features)), size
+            self._bytes += size
         self._photos[photo] = found  # the latest last
-        if len(self._photos) > CACHED_PHOTOS:
-            del self._photos[next(iter(self._photos))]
-        return found
+        while len(self._photos) > MIN_CACHED_PHOTOS and self._bytes > self._room:
+            self._bytes -= self._photos.pop(next(iter(self._photos)))[1]
+        return found[0]
 
 
 def read_vocabulary(database: Path, count: int, seed: int, words: int) -> Words:
@@ -360,12 +373,12 @@ Matched = tuple[np.ndarray, pycolmap.TwoViewGeometry]
 """Matches, and the geometry of two views with those that it explains: none where they are too few."""
 
 
-def _match_here(
-    pool: ThreadPoolExecutor, work: Callable[[Block], list[Matched]], blocks: Iterable[Block]
-) -> Iterator[list[Matched]]:
+def _on_own_cores(
+    pool: ThreadPoolExecutor, work: Callable[[list[Item]], list[Result]], blocks: Iterable[list[Item]]
+) -> Iterator[list[Result]]:
     """Each block on all cores, at work while the one before is written."""
-    before = list[Future[list[Matched]]]()
-    for block in chain(blocks, [Block()]):
+    before = list[Future[list[Result]]]()
+    for block in chain(blocks, [list[Item]()]):
         ahead = [pool.submit(work, [pair]) for pair in block]
         if before:
             yield [found for each in before for found in each.result()]
@@ -477,12 +490,25 @@ def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:
 
 def verify_again(db: pycolmap.Database, seed: int) -> None:
     """Verify all matches anew, by the cameras and keypoints that the database has now."""
-    photo, options = partial(Features().read, db), _verification(seed)
-    for pair_id, matches in zip(*db.read_all_matches(), strict=True):
-        first, second = pycolmap.pair_id_to_image_pair(pair_id)
-        geometry = _verified(photo(first - 1)(), photo(second - 1)(), np.asarray(matches, np.uint32), options)
-        db.delete_two_view_geometry(first, second)
-        db.write_two_view_geometry(first, second, geometry)
+    todo = [
+        (*pycolmap.pair_id_to_image_pair(pair_id), np.asarray(matches, np.uint32))
+        for pair_id, matches in zip(*db.read_all_matches(), strict=True)
+    ]
+    every, photo = _blocks(todo), partial(Features().read, db)
+    with ThreadPoolExecutor(processors()) as pool:
+        blocks = ([(photo(i - 1), photo(j - 1), matches) for i, j, matches in block] for block in every)
+        verified = cluster.fan_out(partial(_verify_block, seed), blocks, partial(_on_own_cores, pool))
+        for block, geometries in zip(every, verified, strict=True):
+            for (i, j, _), geometry in zip(block, geometries, strict=True):
+                db.delete_two_view_geometry(i, j)
+                db.write_two_view_geometry(i, j, geometry)
+
+
+def _verify_block(
+    seed: int, block: list[tuple[SharedPhoto, SharedPhoto, np.ndarray]]
+) -> list[pycolmap.TwoViewGeometry]:
+    options = _verification(seed)
+    return [_verified(first(), second(), matches, options) for first, second, matches in block]
 
 
 def unfinished_copy(database: Path, copy: Path) -> Path:

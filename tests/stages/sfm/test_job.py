@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import stages.sfm.job as job_module
 from stages import sfm
 from stages.contract import run_stage
 from stages.sfm import worker_process
@@ -117,3 +118,14 @@ def test_a_resumed_run_knows_its_earlier_time(
     assert seconds["features"] >= phases["default: features"]
     assert seconds["matching"] >= phases["default: matching"]
     assert not (tmp_path / "sfm/strategies").exists()
+
+
+def test_features_do_not_take_memory_while_mapping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(job_module, "read_vocabulary", lambda *_: np.zeros((2, 128), np.float32))
+    state = work(tmp_path, None, 60)
+    state.begin("matching")
+    features = state.features(state.database)
+    assert state.features(state.database) is features
+    state.end("matching")
+    state.begin("mapping")
+    assert state.features(state.database) is not features

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from threading import get_ident
 
 import numpy as np
 import pycolmap
@@ -20,6 +21,7 @@ from stages.sfm.colmap.database import (
     image_similarity,
     keep_open,
     match_pairs,
+    verify_again,
 )
 from stages.sfm.colmap.diagnosis import links
 from stages.sfm.pairs.pair_selection import exhaustive
@@ -109,6 +111,71 @@ def test_the_number_of_cores_changes_nothing(database: Path, monkeypatch: pytest
     assert results[0] == results[1]
 
 
+def verified_again(database: Path) -> dict[tuple[int, int], tuple[bytes, bytes, int]]:
+    with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
+        verify_again(db, seed=0)
+    return found(database)
+
+
+@pytest.mark.parametrize("cores", [1, 2, 4])
+def test_verifying_again_gives_the_same_on_any_number_of_cores(
+    cores: int, database: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    match_pairs(database, exhaustive(COUNT), 0, 0.8)
+    before, threads, real = found(database), set(), database_module._verified
+    monkeypatch.setattr(database_module, "BLOCK_SIZE", 4)
+    monkeypatch.setattr(database_module, "processors", lambda: cores)
+    monkeypatch.setattr(database_module, "_verified", lambda *args: threads.add(get_ident()) or real(*args))
+    assert verified_again(database) == before and list(before) == PAIRS
+    assert get_ident() not in threads and len(threads) <= cores
+    with pycolmap.Database.open(database) as db:
+        camera = db.read_camera(1)
+        camera.params = [3 * camera.params[0], *camera.params[1:]]
+        camera.has_prior_focal_length = True
+        db.update_camera(camera)
+    monkeypatch.setattr(database_module, "_on_own_cores", lambda _, work, blocks: map(work, blocks))
+    alone = verified_again(copy_of(database, "alone.db"))
+    monkeypatch.undo()
+    assert verified_again(database) == alone != before
+
+
+def test_a_cluster_verifies_the_same(database: Path, ray_cluster: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    match_pairs(database, exhaustive(COUNT), 0, 0.8)
+    before = found(database)
+    monkeypatch.setattr(database_module, "_on_own_cores", lambda *_: pytest.fail("verified here"))
+    with cluster.joined(ray_cluster):
+        assert verified_again(database) == before
+
+
+@pytest.mark.parametrize(("least", "free_bytes", "read"), [(2, 0, 12), (2, 1e9, 6), (6, 0, 6)])
+def test_features_stay_in_memory_as_long_as_there_is_room(
+    least: int, free_bytes: float, read: int, database: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = np.random.default_rng(1).integers(0, 60, (8, 128)).astype(np.float32)
+    monkeypatch.setattr(database_module, "MIN_CACHED_PHOTOS", least)
+    monkeypatch.setattr(database_module, "available_bytes", lambda: free_bytes)
+    indexed, real = [], database_module.index_features
+    monkeypatch.setattr(database_module, "index_features", lambda *args: indexed.append(args) or real(*args))
+    features = Features(words)
+    with pycolmap.Database.open(database) as db:
+        for photo in [*range(COUNT), *range(COUNT)]:
+            assert len(features.read(db, photo)().keypoints) > 200
+    assert len(indexed) == read
+
+
+def test_the_bytes_of_features_are_counted(database: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(database_module, "MIN_CACHED_PHOTOS", 1)
+    each = 400 * (128 + 2 * 8)  # at most: not all points are in all photos
+    monkeypatch.setattr(database_module, "available_bytes", lambda: 3 * each / database_module.CACHE_SHARE)
+    features, opened = Features(), []
+    real = database_module.read_descriptors
+    monkeypatch.setattr(database_module, "read_descriptors", lambda db, photo: opened.append(photo) or real(db, photo))
+    with pycolmap.Database.open(database) as db:
+        for photo in (0, 1, 2, 0, 3, 4, 0, 1):
+            features.read(db, photo)
+    assert opened == [0, 1, 2, 3, 4, 1]
+
+
 @pytest.mark.parametrize("words", [None, np.random.default_rng(1).integers(0, 60, (8, 128)).astype(np.float32)])
 def test_a_cluster_finds_the_same_matches(
     words: np.ndarray | None, database: Path, ray_cluster: str, monkeypatch: pytest.MonkeyPatch
@@ -116,7 +183,7 @@ def test_a_cluster_finds_the_same_matches(
     monkeypatch.setattr(database_module, "BLOCK_SIZE", 4)
     here = copy_of(database, "here.db")
     match_pairs(here, exhaustive(COUNT), 0, 0.8, features=Features(words))
-    monkeypatch.setattr(database_module, "_match_here", lambda *_: pytest.fail("matched here"))
+    monkeypatch.setattr(database_module, "_on_own_cores", lambda *_: pytest.fail("matched here"))
     with cluster.joined(ray_cluster):
         match_pairs(database, exhaustive(COUNT), 0, 0.8, features=Features(words))
     assert list(found(here)) == PAIRS and found(database) == found(here)
