@@ -153,17 +153,19 @@ def _why_useless(strategy: Strategy, missing: list[int], state: JobState) -> str
     """Why the strategy cannot help, None if it can."""
     misfit = _is_misfit(state)
     groups = best.groups if (best := state.usable()) and not misfit else [[]]
-    linked, planar = links(state.latest(), set(groups[0]))
     alone = {state.files[number] for number in missing}.difference(*groups)
     count, given = len(state.photos), state.job.camera_model is not None
-    planar &= len(missing) == count
     long_lenses = all(
         photo.focal_px is not None and photo.focal_px > MIN_LONG_FOCAL * max(photo.width, photo.height)
         for photo in state.photos
     )
     broken = state.log.sequence_broken()
-    now = Situation(len(missing), len(alone), count, linked, planar, given, broken, misfit, long_lenses)
-    return reason_against(strategy, now)
+    now = Situation(len(missing), len(alone), count, True, False, given, broken, misfit, long_lenses)
+    # First as if no matches spoke against it: there are many of them to read.
+    if len(missing) < count and (why := reason_against(strategy, now)):
+        return why
+    linked, planar = links(state.latest(), set(groups[0]))
+    return reason_against(strategy, now._replace(linked=linked, planar=planar and len(missing) == count))
 
 
 def _is_misfit(state: JobState) -> bool:
