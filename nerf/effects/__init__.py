@@ -73,6 +73,13 @@ class RayEffect(Protocol):
         """What was learnt of each image, in the units of files."""
         ...
 
+    @staticmethod
+    def moved_poses(
+        scene_from_camera: Float[Tensor, "views 3 4"], rows: Float[Tensor, "views _"]
+    ) -> Float[Tensor, "views 3 4"]:
+        """The poses that have, without this effect, the rays that images with these ``rows`` have with it."""
+        ...
+
     @classmethod
     def initial(cls, images: Images, measured: Float[Tensor, "views _"] | None) -> "RayEffect":
         """What training begins with; ``measured``: what statistics say of each image, if they do."""

@@ -66,6 +66,14 @@ class PoseRefinement:
         """Rotation vectors in radians and shifts in scene units."""
         return torch.cat([self.turn, self.shift], dim=1)
 
+    @staticmethod
+    def moved_poses(
+        scene_from_camera: Float[Tensor, "views 3 4"], rows: Float[Tensor, "views 6"]
+    ) -> Float[Tensor, "views 3 4"]:
+        """[exp([w]) R | c + t] of poses [R | c]."""
+        turned = rotation_from_vector(rows[:, :3]) @ scene_from_camera[:, :, :3]
+        return torch.cat([turned, (scene_from_camera[:, :, 3] + rows[:, 3:])[:, :, None]], dim=2)
+
     def fix_gauge(self) -> None:
         """Take out what moves all cameras like one body, or scales their places (to first order)."""
         motion = torch.cat([self.turn, self.offset]).double().flatten()

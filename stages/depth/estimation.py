@@ -226,7 +226,7 @@ def _facts(photos: TrainingPhotos, read: ReadMap) -> tuple[dict[str, Any], int]:
     off = off[np.isfinite(off)]
     facts = {
         "photos": len(photos.views),
-        "size": list(photos.viewpoints[0].size),
+        "size": list(max((viewpoint.size for viewpoint in photos.viewpoints), key=max)),
         "downscale": photos.downscale,
         "coverage": round(float(np.mean(list(coverage.values()))), 4),
         "sigma": round(float(np.nanmedian(sigma)), 6) if known else None,
@@ -238,8 +238,10 @@ def _facts(photos: TrainingPhotos, read: ReadMap) -> tuple[dict[str, Any], int]:
 
 def _line(photos: TrainingPhotos, facts: Mapping[str, Any]) -> str:
     width, height = facts["size"]
+    one_size = len({viewpoint.size for viewpoint in photos.viewpoints}) == 1
+    size = f"{width}×{height}" if one_size else f"of up to {max(width, height)} pixels a side"
     off = f", {facts['off_sparse']:.2%} off the sparse points" if facts["off_sparse"] is not None else ""
     return (
-        f"{facts['photos']} photos {width}×{height}, depth at {facts['coverage']:.0%} of the pixels{off} · "
+        f"{facts['photos']} photos {size}, depth at {facts['coverage']:.0%} of the pixels{off} · "
         f"{short_count(facts['points'])} points"
     )

@@ -132,14 +132,19 @@ def _by_angle(rays: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "n 3"]) 
 
 
 def depth_range(
-    poses: Float[np.ndarray, "n 3 4"], tracks: Tracks, pair: tuple[int, int], views: Sequence[View]
+    poses: Float[np.ndarray, "n 3 4"],
+    points: Float[np.ndarray, "m 3"],
+    sees: csr_matrix,
+    pair: tuple[int, int],
+    views: Sequence[View],
 ) -> tuple[float, float]:
     """The nearest and the farthest depth at which a pair's photos may show anything, along the mean of their axes: that
-    of the points that either sees, with room for what carries none; by near and far where there are few points."""
-    seen = np.unique(tracks.point[np.isin(tracks.view, pair)])
+    of the ``points`` that either ``sees`` (:meth:`Tracks.sees`), with room for what carries none; by near and far where
+    there are few points."""
+    seen = np.union1d(*(sees[index].indices for index in pair))
     axis = poses[list(pair), :, 2].sum(axis=0)
     axis = axis / max(float(np.linalg.norm(axis)), 1e-12)
-    depths = (tracks.points[seen] - poses[list(pair), :, 3].mean(axis=0)) @ axis
+    depths = (points[seen] - poses[list(pair), :, 3].mean(axis=0)) @ axis
     depths = depths[depths > 0]
     if len(depths) < FEW_POINTS:
         return min(views[index].near for index in pair), max(views[index].far for index in pair)

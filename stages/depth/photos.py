@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+from scipy.sparse import csr_matrix
 
 from nerf.geometry.scene import Scene, View
 from stages.contract import Inputs, StageError
@@ -51,6 +52,17 @@ class TrainingPhotos:
     @cached_property
     def tracks(self) -> Tracks:
         return tracks_of(self.scene, self.scene.indices_of("train"), self.points)
+
+    @cached_property
+    def _sees(self) -> csr_matrix:
+        return self.tracks.sees(len(self.views))
+
+    @cached_property
+    def _observations(self) -> list[np.ndarray]:
+        """Of each photo the numbers of its observations among those of the points."""
+        order = np.argsort(self.points["view"], kind="stable")
+        starts = np.searchsorted(self.points["view"][order], np.arange(len(self.scene.views) + 1))
+        return [order[starts[index] : starts[index + 1]] for index in self.scene.indices_of("train")]
 
     @cached_property
     def views(self) -> tuple[View, ...]:
@@ -99,7 +111,7 @@ class TrainingPhotos:
     def sparse_depths(self, number: int) -> SparseDepths:
         """The sparse points that a photo shows."""
         viewpoint = self.viewpoints[number]
-        seen = np.flatnonzero(self.points["view"] == self.scene.indices_of("train")[number])
+        seen = self._observations[number]
         at = (self.points["xy"][seen] * viewpoint.scale).astype(int)
         column, row = np.clip(at, 0, np.array(viewpoint.size) - 1).T
         towards = self.points["xyz"][self.points["point"][seen]] - viewpoint.scene_from_camera[:, 3]
@@ -107,7 +119,7 @@ class TrainingPhotos:
 
     def rectified(self, one: int, other: int) -> Rectified:
         """The rectified pair. Raises CannotRectify."""
-        depths = depth_range(self.poses, self.tracks, (one, other), self.views)
+        depths = depth_range(self.poses, self.tracks.points, self._sees, (one, other), self.views)
         return rectify(self.viewpoints[one], self.viewpoints[other], depths, MAX_DISPARITIES)
 
     def pairs(self, neighbours: int) -> tuple[dict[tuple[int, int], Rectified], dict[tuple[int, int], str]]:

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 DEFAULT_SIDE, MIN_SIDE, TIMED_SIDE = 640, 160, 240  # pixels of the longer side
 TIMED_PAIRS = 2
 COST_EXPONENT = 2.6  # of a pair's seconds by its side: pixels and disparities grow with it, what is fixed does not
-MATCHING_SHARE = 0.6  # of the time; the rest is for photos, for what neighbours agree on and for points
+MATCHING_SHARE = 0.6  # of what decoding leaves of the time; the rest is for what neighbours agree on and for points
+DECODINGS = 2  # of each photo: for matching, and for the points' colours
 
 
 def choose_downscale(config: "Config", inputs: Inputs, progress: Progress) -> float:
@@ -26,20 +27,27 @@ def choose_downscale(config: "Config", inputs: Inputs, progress: Progress) -> fl
     if config.seconds is not None:
         progress.update("timing pairs of photos")
         timed = read_training_photos(inputs, max(1.0, longest / TIMED_SIDE))
-        pairs, seconds = _timed(timed, config.neighbours)
-        if seconds > 0:
-            allowed = MATCHING_SHARE * config.seconds * processors() / pairs
+        pairs, seconds, decoding = _timed(timed, config.neighbours)
+        if pairs:
+            allowed = MATCHING_SHARE * max(config.seconds - decoding, 0.0) * processors() / pairs
             side = min(side, max(MIN_SIDE, min(longest, TIMED_SIDE) * (allowed / seconds) ** (1 / COST_EXPONENT)))
     return round(max(1.0, longest / side), 3)
 
 
-def _timed(photos: TrainingPhotos, neighbours: int) -> tuple[int, float]:
-    """How many pairs there are, and seconds that one takes; 0 where there is none."""
+def _timed(photos: TrainingPhotos, neighbours: int) -> tuple[int, float, float]:
+    """How many pairs there are, seconds of a core that one takes once its photos are decoded, and the seconds in which
+    all cores decode all photos, whatever the size of the depth maps."""
     pairs, _ = photos.pairs(neighbours)
     timed = list(pairs.items())[:: max(1, len(pairs) // TIMED_PAIRS)][:TIMED_PAIRS]
+    used = sorted({number for pair, _ in timed for number in pair})
     with one_thread_each():
-        started = time.perf_counter()
+        began = time.perf_counter()
+        for number in used:
+            photos.pixels(number)
+        decoded = time.perf_counter()
         for (one, other), pair in timed:
             viewpoints = photos.viewpoints[one], photos.viewpoints[other]
             candidates(pair, viewpoints, (photos.pixels(one), photos.pixels(other)))
-        return len(pairs), (time.perf_counter() - started) / max(len(timed), 1)
+        matching = time.perf_counter() - decoded
+    decoding = DECODINGS * len(photos.views) * (decoded - began) / max(len(used), 1) / processors()
+    return len(pairs), matching / max(len(timed), 1), decoding

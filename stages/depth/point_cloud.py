@@ -27,6 +27,7 @@ NORMAL_WINDOW = 7  # pixels along each side of the patch whose plane gives a nor
 MIN_NORMAL_PIXELS = 9
 OPEN = 1e-14  # of the moments' determinant by their trace cubed: pixels in a row leave a direction open
 MAX_POINTS = 10_000_000
+COUNTED_PHOTOS = 8  # of which it is counted how many pixels become points, where there may be more of them than that
 ReadMap = Callable[[int], DepthMap]
 
 
@@ -43,7 +44,7 @@ class PointCloud(NamedTuple):
 def fuse(photos: TrainingPhotos, read: ReadMap, known: int, tell: Callable[[float], None]) -> PointCloud:
     """The cloud of all depth maps, which have ``known`` pixels in all."""
     others = _overlapping(photos)
-    share = min(1.0, MAX_POINTS / max(known, 1))
+    share = 1.0 if known <= MAX_POINTS else min(1.0, MAX_POINTS / (known * _kept_share(photos, read, others)))
 
     def of_photo(number: int) -> PointCloud:
         return _of_photo(photos, read, number, others[number], share)
@@ -53,6 +54,13 @@ def fuse(photos: TrainingPhotos, read: ReadMap, known: int, tell: Callable[[floa
         clouds.append(cloud)
         tell(done / len(photos.views))
     return PointCloud(*(np.concatenate(part) for part in zip(*clouds, strict=True)))
+
+
+def _kept_share(photos: TrainingPhotos, read: ReadMap, others: list[list[int]]) -> float:
+    """Which share of the known pixels become points, by some of the photos."""
+    some = range(0, len(photos.views), -(-len(photos.views) // COUNTED_PHOTOS))
+    kept = sum(len(_of_photo(photos, read, number, others[number], 1.0).points) for number in some)
+    return max(kept, 1) / max(sum(int(np.count_nonzero(read(number).distance)) for number in some), 1)
 
 
 def _overlapping(photos: TrainingPhotos) -> list[list[int]]:
@@ -67,12 +75,9 @@ def _overlapping(photos: TrainingPhotos) -> list[list[int]]:
 
 
 def _of_photo(photos: TrainingPhotos, read: ReadMap, number: int, others: list[int], share: float) -> PointCloud:
-    """The points that one photo gives."""
+    """The points that one photo gives, or a ``share`` of them, evenly."""
     viewpoint, depth = photos.viewpoints[number], read(number)
     row, column = np.nonzero(depth.distance > 0)
-    if share < 1:
-        drawn = np.diff(np.floor(np.arange(len(row) + 1) * share)) > 0
-        row, column = row[drawn], column[drawn]
     distance, sigma = depth.distance[row, column].astype(float), depth.sigma[row, column]
     rotation, centre = viewpoint.scene_from_camera[:, :3], viewpoint.scene_from_camera[:, 3]
     local = distance[:, None] * viewpoint.ray_directions[row, column]
@@ -89,6 +94,7 @@ def _of_photo(photos: TrainingPhotos, read: ReadMap, number: int, others: list[i
         finest &= ~(agrees & finer)
         colours.append(np.where(agrees[:, None], colour, np.float32(np.nan)))
     kept = np.flatnonzero(finest & (agreeing > 1) & (agreeing > seen_through))
+    kept = kept[np.diff(np.floor(np.arange(len(kept) + 1) * share)) > 0]
     colour = _medians(np.stack([one[kept] for one in colours]))
     normal = normals(viewpoint, depth)[row[kept], column[kept]] @ rotation.T
     return PointCloud(points[kept], normal, np.rint(colour).astype(np.uint8), agreeing[kept].astype(np.uint8))

@@ -5,6 +5,7 @@ name.
 """
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,6 +55,19 @@ def held_out_images(
     poses, known = (np.stack([view.scene_from_camera for view in views]) for views in (held_out, trained))
     weights = torch.tensor(neighbour_weights(poses, known), dtype=torch.float32, device=device)
     return HeldOutImages(images_of(scene, held_out, device), weights)
+
+
+def learnt_poses(field: dict[str, Any], scene: Scene) -> Scene:
+    """The scene with the training photos where the field of this field.json learnt that they were taken."""
+    views = list(scene.views)
+    for effect in EFFECTS:
+        if (rows := field["effects"].get(effect.name)) and (rays := effect.load().rays):
+            known = [index for index, view in enumerate(views) if view.name in rows]
+            poses = torch.tensor(np.stack([views[index].scene_from_camera for index in known]))
+            learnt = torch.tensor([rows[views[index].name] for index in known], dtype=poses.dtype)
+            for index, pose in zip(known, rays.moved_poses(poses, learnt).numpy(), strict=True):
+                views[index] = replace(views[index], scene_from_camera=pose)
+    return replace(scene, views=tuple(views))
 
 
 def refines_poses(names: Collection[str]) -> bool:

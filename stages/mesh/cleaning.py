@@ -175,13 +175,16 @@ def _covers(label: np.ndarray, area: np.ndarray, marked: np.ndarray, fraction: f
     return np.bincount(label, area * marked) >= fraction * np.bincount(label, area)
 
 
-def boundary(surface: Surface, box: np.ndarray, voxel: float) -> str:
-    """Where the surface ends: "watertight", or "open" and where, for a grid over a box (2, 3)."""
+def boundary(surface: Surface, box: np.ndarray, voxel: float, cropped: bool = False) -> str:
+    """Where the surface ends: "watertight", or "open" and where, for a grid over a box (2, 3). Of one that was
+    ``cropped`` it is not known which border is the crop's."""
     if is_watertight(surface):
         return "watertight"
     border = border_vertices(surface)
     if len(border) == 0:
         return "closed, but not a manifold"
+    if cropped:
+        return "open, cropped by --mesh.box"
     at_box = ((border < box[0] + voxel / 2) | (border > box[1] - voxel / 2)).any(axis=1)
     places = [("at the edge of the region", at_box.any()), ("where too few photos see it", not at_box.all())]
     return "open " + " and ".join(place for place, present in places if present)

@@ -1,18 +1,26 @@
 """Fewer triangles for the same surface."""
 
 import numpy as np
+import torch
 from fast_simplification import simplify
 
+from nerf.geometry.space_maps import SpaceMap
 from stages.mesh.surface import Surface, keep_faces
 
 
-def decimate(surface: Surface, max_faces: int) -> Surface:
+def decimate(surface: Surface, max_faces: int, space: SpaceMap) -> Surface:
     """Collapse edges until ``max_faces`` remain (quadrics, Garland and Heckbert 1997); open borders stay put, and faces
-    folded onto each other are removed."""
+    folded onto each other are removed.
+
+    Distances count as in the field's ``space``: where cameras face one way, by what they are in the photos, so that
+    what is near has its share of the faces.
+    """
     if len(surface.faces) <= max_faces:
         return surface
-    vertices, faces, *_ = simplify(surface.vertices, surface.faces, target_count=max_faces, preserve_border=True)
-    return keep_faces(Surface(vertices.astype(np.float64), faces.astype(np.int32)), ~_folded_pairs(faces))[0]
+    mapped = space.forward(torch.from_numpy(surface.vertices)).numpy()
+    vertices, faces, *_ = simplify(mapped, surface.faces, target_count=max_faces, preserve_border=True)
+    vertices = space.inverse(torch.from_numpy(vertices.astype(np.float64))).numpy()
+    return keep_faces(Surface(vertices, faces.astype(np.int32)), ~_folded_pairs(faces))[0]
 
 
 def _folded_pairs(faces: np.ndarray) -> np.ndarray:

@@ -10,9 +10,10 @@ from scipy.spatial import KDTree
 from nerf.fields.density_grid import DensityGrid, sample_density_grid
 from nerf.fields.interface import RadianceModel
 from nerf.geometry.scene import Scene, Similarity
+from nerf.geometry.space_maps import SpaceMap, space_map
 from nerf.rendering.volume_rendering import composite
 from stages.contract import Inputs, Progress, StageError, StageResult
-from stages.effects.image_effects import new_view_words
+from stages.effects.image_effects import learnt_poses, new_view_words
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_bytes, check_memory
 from stages.io.field_files import load_field
@@ -40,11 +41,13 @@ BYTES_PER_POINT = 20  # density, occupancy, its averages and marching cubes; 16 
 
 
 class Source(NamedTuple):
-    """What a mesh is made from: the field and its ``info`` (field.json), the scene, sparse ``points`` (n, 3) in the
-    scene frame, the folder of stage ``ingest`` with the masks, metres a unit of the sfm frame where they are known."""
+    """What a mesh is made from: the field, its ``info`` (field.json) and ``space``, the scene, sparse ``points`` (n, 3)
+    in the scene frame, the folder of stage ``ingest`` with the masks, and metres a unit of the sfm frame where they are
+    known."""
 
     model: RadianceModel
     info: dict[str, Any]
+    space: SpaceMap
     scene: Scene
     points: np.ndarray
     ingest: Path
@@ -77,13 +80,13 @@ class Extracted(NamedTuple):
 
 
 def load(inputs: Inputs, progress: Progress) -> Source:
-    """Read the field, the scene and the sparse points."""
+    """Read the field, the scene with the poses that the field learnt, and the sparse points."""
     device = compute_device()
     model, info = load_field(inputs["train"], device, progress)
     points = read_tensors(inputs["normalise"] / "points.safetensors")["xyz"].astype(float)
-    return Source(
-        model, info, read_scene(inputs["normalise"]), points, inputs["ingest"], device, metres_per_unit(inputs["scale"])
-    )
+    scene = learnt_poses(info, read_scene(inputs["normalise"]))
+    space = space_map(**info["settings"]["space"])
+    return Source(model, info, space, scene, points, inputs["ingest"], device, metres_per_unit(inputs["scale"]))
 
 
 def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extracted:
@@ -105,8 +108,8 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     cleaned = clean(
         raw, visibility, source.points, config.keep, min_views, config.min_component, source.scene.has_alpha
     )
-    surface = decimate(_cropped(config, cleaned.surface, source), config.max_faces)
-    ends = boundary(surface, box, voxel)
+    surface = decimate(_cropped(config, cleaned.surface, source), config.max_faces, source.space)
+    ends = boundary(surface, box, voxel, cropped=config.box is not None)
     if config.close:
         surface, closed = close_holes(surface, config.close)
         ends = "watertight" if is_watertight(surface) else ends
@@ -234,7 +237,7 @@ def write_mesh(config: "Config", mesh: ColouredMesh, source: Source, folder: Pat
     names."""
     write_png(folder / "preview.png", preview(mesh, source.scene))
     names = ["preview.png"]
-    if (small := small_copy(mesh)) is not None:
+    if (small := small_copy(mesh, source.space)) is not None:
         write_tensors(folder / SMALL_COPY, small)
         names.append(SMALL_COPY)
     files_from_scene = source.files_from_scene(config.frame)

@@ -5,6 +5,7 @@ from scipy.spatial import KDTree
 
 from nerf.geometry.camera_paths import levelled
 from nerf.geometry.scene import Scene
+from nerf.geometry.space_maps import SpaceMap
 from stages.mesh.decimation import decimate
 from stages.mesh.files import ColouredMesh
 from stages.mesh.rasteriser import Viewpoint, frame_mesh, rasterise, shade
@@ -31,10 +32,10 @@ def preview(mesh: ColouredMesh, scene: Scene) -> np.ndarray:
     return np.concatenate(rows)
 
 
-def small_copy(mesh: ColouredMesh) -> dict[str, np.ndarray] | None:
+def small_copy(mesh: ColouredMesh, space: SpaceMap) -> dict[str, np.ndarray] | None:
     """About SMALL_FACES faces of the mesh, for pages: ``positions`` int16, 32767 being the ``radius`` of the sphere
     around the ``middle``, ``faces`` uint16, ``colours`` uint8. None for one that stays too large: it is all borders."""
-    small = decimate(Surface(mesh.vertices, mesh.faces), SMALL_FACES)
+    small = decimate(Surface(mesh.vertices, mesh.faces), SMALL_FACES, space)
     if len(small.vertices) > MAX_SMALL_VERTICES or not len(small.faces):
         return None
     low, high = small.vertices.min(axis=0), small.vertices.max(axis=0)

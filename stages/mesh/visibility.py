@@ -17,12 +17,14 @@ from scipy.ndimage import maximum_filter
 from nerf.fields.density_grid import DensityGrid, median_depth
 from nerf.geometry.rays import Rays, join_rays
 from nerf.geometry.scene import Camera, Scene, View
+from nerf.runtime.parallel import in_order
 from nerf.runtime.randomness import generator
 from stages.sfm.colmap.cameras import project
 from stages.train.data import view_mask, view_rays
 
 NUM_RAYS = 1 << 17  # over all photos: enough for the iso-level and the maps, seconds on two cores
-MAX_MAP_SIDE = 96
+# However many photos there are, a cell must not be so large that the farthest thing in it hides nothing any more.
+MIN_MAP_SIDE, MAX_MAP_SIDE = 48, 96
 MAX_MASK_SIDE = 384  # a cell counts as ignored if any pixel in it is, and thin things must not go
 DEPTH_BIAS_VOXELS = 3.0  # the surface lies before the median depth, and the map is coarse
 MIN_COSINE = 0.1  # between viewing ray and normal; below it a vertex is grazed, not visible
@@ -56,13 +58,14 @@ class ShadowMap(NamedTuple):
 def shadow_maps(
     grid: DensityGrid, scene: Scene, ingest: Path, views: Sequence[View], on_view: Callable[[float], None]
 ) -> list[ShadowMap]:
-    """One map per photo; together about ``NUM_RAYS`` rays, each with a sample per voxel of the longest edge. Masks lie
-    in the folder of stage ``ingest``."""
+    """One map per photo; together about ``NUM_RAYS`` rays, more of many photos, each with a sample per voxel of the
+    longest edge. Masks lie in the folder of stage ``ingest``."""
     maps = []
     for number, view in enumerate(views):
         camera = scene.cameras[view.camera]
-        pixels = camera.width * camera.height
-        downscale = max((pixels * len(views) / NUM_RAYS) ** 0.5, max(camera.width, camera.height) / MAX_MAP_SIDE, 1.0)
+        pixels, longer = camera.width * camera.height, max(camera.width, camera.height)
+        shared = min((pixels * len(views) / NUM_RAYS) ** 0.5, longer / MIN_MAP_SIDE)
+        downscale = max(shared, longer / MAX_MAP_SIDE, 1.0)
         rays = view_rays(scene, view, downscale)
         rays = rays.each(lambda part: part.to(grid.low.device))
         depth = median_depth(grid, rays, max(grid.values.shape)).cpu().numpy()
@@ -98,10 +101,12 @@ def sample_rays(maps: list[ShadowMap], count: int) -> Rays:
 
 def vertex_visibility(vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxel: float) -> Visibility:
     """The visibility of every vertex in all photos; ``voxel`` is the grid's spacing in scene units."""
-    chunks = [
-        _chunk_visibility(vertices[start : start + CHUNK], normals[start : start + CHUNK], maps, voxel)
-        for start in range(0, len(vertices), CHUNK)
-    ]
+
+    def of_chunk(start: int) -> Visibility:
+        some = slice(start, start + CHUNK)
+        return _chunk_visibility(vertices[some], normals[some], maps, voxel)
+
+    chunks = list(in_order(of_chunk, range(0, len(vertices), CHUNK), torch.device("cpu")))
     return Visibility(*map(np.concatenate, zip(*chunks, strict=True)))
 
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 MAX_ERROR = 0.05  # of a scale that is worth having
 MAX_IRREGULARITY = 0.04  # of a square: one that is cut off, bent or printed out of proportion has no one side
 MIN_AGREEING = 2 / 3  # of the photos that show a marker, about its place
+MAX_REPEATED = 1 / 3  # of the photos that show a marker, more than once each: these are left out
 
 
 def marker_references(config: "Config", scene: Scene, ingest: Path, progress: Progress) -> Iterator[Reference]:
@@ -30,7 +31,7 @@ def marker_references(config: "Config", scene: Scene, ingest: Path, progress: Pr
     if not markers:
         return
     sightings = _search(markers, scene, ingest, progress)
-    mirrored = _mirrored([marker for marker in markers if not sightings[marker]], scene, ingest)
+    mirrored = _mirrored([marker for marker in markers if not sightings[marker]], scene, ingest, progress)
     for marker in markers:
         seen = sightings[marker]
         if not seen:
@@ -80,17 +81,24 @@ def _photo(view: View, scene: Scene, ingest: Path) -> np.ndarray:
     return load_pixels(ingest / view.file, camera.width, camera.height)
 
 
-def _mirrored(missing: Sequence[Marker], scene: Scene, ingest: Path) -> set[Marker]:
+def _mirrored(missing: Sequence[Marker], scene: Scene, ingest: Path, progress: Progress) -> set[Marker]:
     """Those of some markers whose mirror images are in the photos. These are decoded once more for it: a marker that no
     photo shows is rare, and looking for mirror images takes as long in every photo as looking for markers."""
-    found = set[Marker]()
-    for view in scene.views:
-        if len(found) == len(missing):
-            break
-        photo = _photo(view, scene, ingest)
+    if not missing:
+        return set()
+
+    def search(view: View) -> set[Marker]:
+        photo, found = _photo(view, scene, ingest), set[Marker]()
         for dictionary in {marker.dictionary for marker in missing}:
             here = {(dictionary, each.number) for each in find_markers(photo, dictionary, mirrored=True)}
             found |= {marker for marker in missing if (marker.dictionary, marker.number) in here}
+        return found
+
+    found = set[Marker]()
+    with ThreadPoolExecutor(loaders(ingest / view.file for view in scene.views)) as pool:
+        for done, here in enumerate(pool.map(search, scene.views)):
+            found |= here
+            progress.update("mirror images of markers in the photos", done / len(scene.views))
     return found
 
 
@@ -99,9 +107,12 @@ def _measured(marker: Marker, seen: Sequence[_Sighting], scene: Scene, progress:
     photos = len({sighting.view for sighting in seen})
     if photos < 2:
         return _unusable(marker, photos, ONE_PHOTO, progress)
-    if any(sighting.times > 1 for sighting in seen):
+    once = [sighting for sighting in seen if sighting.times == 1]
+    if photos - len(once) > MAX_REPEATED * photos:
         return _unusable(marker, photos, REPEATED, progress)
-    square = fit_square(_sightings(seen, scene))
+    if len(once) < 2:
+        return _unusable(marker, len(once), ONE_PHOTO, progress)
+    square = fit_square(_sightings(once, scene))
     if square is None or square.agreeing.mean() < MIN_AGREEING:
         return _unusable(marker, photos, SEVERAL_PLACES, progress)
     error = square.standard_error / square.side
@@ -137,7 +148,7 @@ MIRRORED = Note(
     "scale.mirrored", "the photos show its mirror image: print it as it is, or give photos that are not mirrored"
 )
 ONE_PHOTO = Note("scale.one-photo", "only one photo shows it, and it takes two from different places")
-REPEATED = Note("scale.repeated", "a photo shows it twice: print each marker once")
+REPEATED = Note("scale.repeated", "photos show it twice: print each marker once")
 SEVERAL_PLACES = Note(
     "scale.several-places", "the photos disagree about where it is: it was moved, or printed more than once"
 )

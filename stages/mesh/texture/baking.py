@@ -7,7 +7,10 @@ and in closed form). Where photos take turns their weights change linearly acros
 belong to vertices, not to texels: the texture is continuous across the charts' borders.
 """
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import cv2
 import numpy as np
@@ -18,7 +21,7 @@ from nerf.runtime.parallel import in_order
 from stages.mesh.rasteriser import barycentric, covered_pixels
 from stages.mesh.surface import Surface
 from stages.mesh.texture.atlas import Atlas
-from stages.mesh.texture.photos import Photo, colours_at, projected, read_picture
+from stages.mesh.texture.photos import Photo, Picture, colours_at, projected, read_picture
 from stages.mesh.texture.view_selection import Candidates, Choice
 
 LEVELLING_STEPS = 6  # over neighbours, of the differences between photos
@@ -45,10 +48,17 @@ def bake(
         light[texel] = _within(corner, rest[surface.faces[face]])
         covered[texel] = True
 
-    for index, photo in enumerate(photos):
-        for texel, colour in _of_photo(surface, atlas, photo, index, choice, means):
-            light[texel] += colour
-        on_photo((index + 1) / len(photos))
+    # The next photo is decoded on a thread of its own while the cores bake this one.
+    used = [index for index in range(len(photos)) if len(choice.weights[index][0])]
+    with ThreadPoolExecutor(1) as ahead:
+        read = partial(read_picture, downscale=max(1.0, 1 / atlas.texels_per_pixel))
+        upcoming = deque(ahead.submit(read, photos[index]) for index in used[:1])
+        for done, index in enumerate(used):
+            picture = upcoming.popleft().result()
+            upcoming.extend(ahead.submit(read, photos[following]) for following in used[done + 1 : done + 2])
+            for texel, colour in _of_photo(surface, atlas, (photos[index], picture), index, choice, means):
+                light[texel] += colour
+            on_photo((done + 1) / len(used))
     picture = np.empty((atlas.height * atlas.width, 3), np.uint8)
     for start in range(0, len(picture), TEXELS_AT_ONCE):
         some = slice(start, start + TEXELS_AT_ONCE)
@@ -59,15 +69,17 @@ def bake(
 
 
 def _of_photo(
-    surface: Surface, atlas: Atlas, photo: Photo, index: int, choice: Choice, means: csr_array
+    surface: Surface,
+    atlas: Atlas,
+    shown: tuple[Photo, Picture],
+    index: int,
+    choice: Choice,
+    means: csr_array,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """What a photo adds to the texture: texels, and colours (n, 3) float32 times what they weigh. A block of faces at a
     time on each core: all that a photo shows would take more memory than the texture."""
-    weight = choice.weight(index)
+    (photo, picture), weight = shown, choice.weight(index)
     faces = np.flatnonzero(weight[surface.faces].any(axis=1))
-    if len(faces) == 0:
-        return
-    picture = read_picture(photo, max(1.0, 1 / atlas.texels_per_pixel))
     level = _levelling(choice.candidates, index, choice.colour, means)
     of_vertex = np.concatenate([surface.vertices, level, weight[:, None]], axis=1)
 

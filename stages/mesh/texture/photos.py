@@ -18,7 +18,7 @@ from nerf.geometry.scene import Camera, Scene, View
 from stages.contract import StageError
 from stages.effects.image_effects import new_view_effects, photo_effects
 from stages.io.photos import read_photos
-from stages.io.pixels import load_mask, load_pixels
+from stages.io.pixels import OPAQUE_FROM, load_mask, load_pixels
 from stages.sfm.colmap.cameras import border_rays, focal_and_centre, project
 
 REMAP_SIDE = 1 << 14  # points that OpenCV takes in a row
@@ -27,7 +27,7 @@ REMAP_SIDE = 1 << 14  # points that OpenCV takes in a row
 class Photo(NamedTuple):
     """A training photo: ``focal_px`` its mean focal length, ``min_cosine`` between the optical axis and its outermost
     ray, ``sharpness`` 1 where it is as sharp as its neighbours, ``effects`` what it does to the scene's colours and
-    ``shown`` what new views do to them."""
+    ``shown`` what new views do to them. ``has_alpha``: its alpha, if any, says what is background."""
 
     view: View
     camera: Camera
@@ -37,6 +37,7 @@ class Photo(NamedTuple):
     sharpness: float
     effects: tuple[ColourEffect, ...]
     shown: tuple[ColourEffect, ...]
+    has_alpha: bool
 
 
 class Projection(NamedTuple):
@@ -67,7 +68,8 @@ def photo_of(view: View, scene: Scene, ingest: Path, field: dict[str, Any]) -> P
     camera = scene.cameras[view.camera]
     focal_px, min_cosine = _optics(camera)
     effects, shown = photo_effects(field, scene, view), new_view_effects(field)
-    return Photo(view, camera, ingest, focal_px, min_cosine, _sharpness(ingest).get(view.file, 1.0), effects, shown)
+    sharpness = _sharpness(ingest).get(view.file, 1.0)
+    return Photo(view, camera, ingest, focal_px, min_cosine, sharpness, effects, shown, scene.has_alpha)
 
 
 @lru_cache
@@ -94,7 +96,8 @@ def projected(photo: Photo, points: np.ndarray) -> Projection:
 
 
 def read_picture(photo: Photo, downscale: float) -> Picture:
-    """The photo at 1/``downscale`` of its size. Masked pixels do not count, nor those that alpha says are not opaque.
+    """The photo at 1/``downscale`` of its size. Masked pixels do not count, nor those that alpha says are background,
+    with the mixed pixels beside them.
 
     Raises StageError where its file is gone or cannot be read.
     """
@@ -110,8 +113,9 @@ def read_picture(photo: Photo, downscale: float) -> Picture:
             "Run stage ingest again (--from ingest), or use --mesh.texture-size 0 for a mesh without texture.",
         ) from error
     used = np.ones((height, width), np.uint8) if mask is None else mask.astype(np.uint8)
-    if pixels.shape[2] == 4:
-        used &= pixels[..., 3] == 255
+    if photo.has_alpha and pixels.shape[2] == 4:
+        opaque = (pixels[..., 3] >= OPAQUE_FROM).astype(np.uint8)
+        used &= cv2.erode(opaque, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
     return Picture(np.ascontiguousarray(pixels[..., :3]), used)
 
 

@@ -42,21 +42,22 @@ def texture_of(
     uint8 of the vertices hold where no photo sees them; ``field``: the content of field.json; ``voxel``: how well the
     surface is known. None where no photo sees any of the surface. Raises StageError where that is too small, too large
     for the memory, or a photo is gone."""
-    needed = BYTES_PER_TEXEL * max_size**2
-    hint = f"Try --mesh.texture-size {max_size // 2}."
-    check_memory(needed, "the texture", f"{max_size} × {max_size} texels need up to", hint)
     photos, means = photos_of(scene, ingest, field), neighbour_means(surface)
     candidates = find_candidates(
         surface, photos, means, voxel, lambda done: report("choosing photos for the texture", 0.5 * done)
     )
     own = field_colours.astype(np.float32) / 255
     choice = choose(candidates, own, surface.faces, means, len(photos))
-    best = np.sqrt(choice.candidates.quality.max(axis=1, initial=0))
+    best = np.sqrt(choice.candidates.pixels_of_best())
     seen = best > 0
     if not seen.any():
         return None
     least = UNSEEN_DENSITY * float(np.median(best[seen]))
     report("laying out the texture", 0.5)
     atlas = make_atlas(surface, np.maximum(best, least)[surface.faces].max(axis=1), max_size)
+    needed, size = BYTES_PER_TEXEL * atlas.width * atlas.height, f"{atlas.width} × {atlas.height}"
+    check_memory(
+        needed, "the texture", f"{size} texels need", f"Try --mesh.texture-size {max(atlas.width, atlas.height) // 2}."
+    )
     picture = bake(surface, atlas, photos, choice, means, lambda done: report("baking the texture", 0.55 + 0.45 * done))
     return Textured(Texture(atlas, picture), float(1 - seen.mean()), choice.outliers)

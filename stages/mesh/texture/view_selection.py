@@ -38,10 +38,26 @@ OUTLIER_SPREADS, MIN_OUTLIER, OUTLIER_SHARE, OUTLIER_STEPS = 3.0, 0.10, 0.25, 3
 
 
 class Candidates(NamedTuple):
-    """The best photos of each vertex, (n, KEPT_PHOTOS): their index, what their ``quality`` is (pixels per unit of
-    area; 0: none) and their ``colour`` (n, KEPT_PHOTOS, 3) at the scale of the surface's edges."""
+    """The best photos of each vertex, (n, KEPT_PHOTOS): their index, their sharp ``pixels`` per unit of area, their
+    ``quality`` (these, less where a photo tells less; 0: none), and their ``colour`` (n, KEPT_PHOTOS, 3) at the scale
+    of the surface's edges."""
 
     photo: np.ndarray
+    pixels: np.ndarray
+    quality: np.ndarray
+    colour: np.ndarray
+
+    def pixels_of_best(self) -> np.ndarray:
+        """Those of the best photo of each vertex, (n,); 0 where no photo sees it."""
+        best = self.quality.argmax(axis=1)[:, None]
+        pixels, quality = (np.take_along_axis(each, best, axis=1)[:, 0] for each in (self.pixels, self.quality))
+        return np.where(quality > 0, pixels, 0)
+
+
+class Shown(NamedTuple):
+    """What one photo shows of some vertices, as in :class:`Candidates`."""
+
+    pixels: np.ndarray
     quality: np.ndarray
     colour: np.ndarray
 
@@ -84,6 +100,7 @@ def find_candidates(
     kept = Candidates(
         np.zeros((count, slots), np.int32),
         np.zeros((count, slots), np.float32),
+        np.zeros((count, slots), np.float32),
         np.zeros((count, slots, 3), np.float32),
     )
     normals = vertex_normals(surface)
@@ -92,26 +109,28 @@ def find_candidates(
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
     edge = float(np.sqrt(np.median(np.linalg.norm(face_area_vectors(*surface), axis=1))))
 
-    def seen_by(photo: Photo) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def seen_by(photo: Photo) -> tuple[np.ndarray, Shown]:
         place = projected(photo, surface.vertices)
-        quality = _quality(surface, normals, photo, place, voxel)
-        seen = np.flatnonzero(quality)
+        pixels, counts = _pixels(surface, normals, photo, place, voxel)
+        seen = np.flatnonzero(pixels * counts)
         if len(seen) == 0:
-            return seen, quality[seen], np.zeros((0, 3), np.float32)
+            return seen, Shown(pixels[seen], counts[seen], np.zeros((0, 3), np.float32))
         edge_px = edge * photo.focal_px / float(np.median(place.depth[seen]))
         picture = read_picture(photo, max(1.0, edge_px))
-        colour, counts = _shown(photo, picture, place.pixels[seen], surface.vertices[seen])
-        return seen, quality[seen] * counts, colour
+        colour, told = _shown(photo, picture, place.pixels[seen], surface.vertices[seen])
+        return seen, Shown(pixels[seen], pixels[seen] * counts[seen] * told, colour)
 
-    for index, (seen, quality, colour) in enumerate(in_order(seen_by, photos, torch.device("cpu"))):
-        _keep_best(kept, seen, index, quality, colour)
+    for index, (seen, shown) in enumerate(in_order(seen_by, photos, torch.device("cpu"))):
+        _keep_best(kept, seen, index, shown)
         on_photo((index + 1) / len(photos))
     return kept
 
 
-def _quality(surface: Surface, normals: np.ndarray, photo: Photo, place: Projection, voxel: float) -> np.ndarray:
-    """How finely a photo shows each vertex, (n,) float32: its sharp pixels per unit of area, less towards its borders;
-    0 where it does not see it."""
+def _pixels(
+    surface: Surface, normals: np.ndarray, photo: Photo, place: Projection, voxel: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """How finely a photo shows each vertex, its sharp pixels per unit of area, 0 where it does not see it; and what
+    each of these counts: less towards the photo's borders and next to silhouettes. Both (n,) float32."""
     towards = photo.view.scene_from_camera[:, 3] - surface.vertices
     distance = np.linalg.norm(towards, axis=1)
     cosine = (normals * towards).sum(axis=1) / np.maximum(distance, np.finfo(float).tiny)
@@ -120,8 +139,8 @@ def _quality(surface: Surface, normals: np.ndarray, photo: Photo, place: Project
     size = np.array([photo.camera.width, photo.camera.height])
     border = np.minimum(place.pixels, size - place.pixels).min(axis=1) / (BORDER * size.min())
     pixels = cosine * (photo.focal_px / np.maximum(distance, np.finfo(float).tiny)) ** 2
-    quality = pixels * np.clip(photo.sharpness, 0.1, 1.0) * np.clip(border, 0.01, 1)
-    return np.where(ahead & clear, np.where(near_edge, IN_MARGIN, 1.0) * quality, 0.0).astype(np.float32)
+    sharp = np.where(ahead & clear, pixels * np.clip(photo.sharpness, 0.1, 1.0), 0.0)
+    return sharp.astype(np.float32), (np.where(near_edge, IN_MARGIN, 1.0) * np.clip(border, 0.01, 1)).astype(np.float32)
 
 
 def _visible(
@@ -158,13 +177,14 @@ def _shown(photo: Photo, picture: Picture, pixels: np.ndarray, points: np.ndarra
     return colour, counts.astype(np.float32)
 
 
-def _keep_best(kept: Candidates, vertex: np.ndarray, photo: int, quality: np.ndarray, colour: np.ndarray) -> None:
+def _keep_best(kept: Candidates, vertex: np.ndarray, photo: int, shown: Shown) -> None:
     """Put a photo in the place of the worst one of each vertex that it is better at."""
     worst = kept.quality[vertex].argmin(axis=1)
-    better = quality > kept.quality[vertex, worst]
+    better = shown.quality > kept.quality[vertex, worst]
     vertex, slot = vertex[better], worst[better]
-    kept.photo[vertex, slot], kept.quality[vertex, slot] = photo, quality[better]
-    kept.colour[vertex, slot] = colour[better]
+    kept.photo[vertex, slot] = photo
+    for ours, its in zip(kept[1:], shown, strict=True):
+        ours[vertex, slot] = its[better]
 
 
 def choose(candidates: Candidates, field: np.ndarray, faces: np.ndarray, means: csr_array, photos: int) -> Choice:

@@ -41,6 +41,21 @@ def test_rays_turn_and_shift_with_their_own_camera() -> None:
     torch.testing.assert_close(moved.directions.norm(dim=-1), torch.ones(6))
 
 
+def test_moved_poses_have_the_rays_that_it_makes() -> None:
+    random = torch.Generator().manual_seed(5)
+    poses = PoseRefinement(torch.zeros(3, 3), torch.full((3,), 0.5))
+    poses.turn += 0.3 * torch.randn(3, 3, generator=random)
+    poses.offset += 0.3 * torch.randn(3, 3, generator=random)
+    rotations, _ = torch.linalg.qr(torch.randn(3, 3, 3, generator=random))
+    centres, local = torch.randn(3, 3, generator=random), rays(3).directions
+    at = torch.arange(3)
+    given = rays(3)._replace(origins=centres, directions=(rotations @ local[:, :, None])[:, :, 0])
+    moved = poses.forward(given, at)
+    pose = PoseRefinement.moved_poses(torch.cat([rotations, centres[:, :, None]], dim=2), poses.rows)
+    torch.testing.assert_close(pose[:, :, 3], moved.origins)
+    torch.testing.assert_close((pose[:, :, :3] @ local[:, :, None])[:, :, 0], moved.directions)
+
+
 def test_backward_is_the_derivative_of_forward() -> None:
     poses, given = PoseRefinement(torch.zeros(3, 3)), rays()
     random = torch.Generator().manual_seed(2)

@@ -162,8 +162,10 @@ def test_two_photos_cannot_agree(tmp_path) -> None:
 @pytest.mark.parametrize("count", [1, 4])
 def test_photos_from_one_place_are_refused(count: int, tmp_path) -> None:
     poses = np.repeat(cameras_before()[:1], count, axis=0)
+    inputs = a_scene(poses).write(tmp_path)
+    assert plan_stage(depth, Config(seconds=10), inputs, RecordedProgress()).downscale == 1
     with refused("depth.no-pairs", count):
-        result_of(a_scene(poses).write(tmp_path), tmp_path / "out")
+        result_of(inputs, tmp_path / "out")
 
 
 def test_photos_taken_while_walking_ahead_are_named(tmp_path) -> None:

@@ -39,7 +39,8 @@ def test_photos_from_one_place_or_of_other_things_are_none() -> None:
 def test_the_range_of_depths_holds_what_is_seen() -> None:
     poses = ring(36)
     points = ball(300)
-    low, high = depth_range(poses, tracks_in(poses, points), (0, 1), [])
+    tracks = tracks_in(poses, points)
+    low, high = depth_range(poses, tracks.points, tracks.sees(len(poses)), (0, 1), [])
     distance = np.linalg.norm(poses[0, :, 3])
     assert 0.6 * (distance - 1) < low < distance - 0.9
     assert distance + 0.9 < high < 2 * (distance + 1)
@@ -51,4 +52,6 @@ def test_near_and_far_tell_the_range_without_points() -> None:
 
     poses = ring(36)
     nothing = Tracks(np.zeros((0, 3)), np.zeros(0, int), np.zeros(0, int))
-    assert depth_range(poses, nothing, (0, 1), [View(), View()]) == (pytest.approx(0.5), pytest.approx(9.0))  # type: ignore[list-item]
+    views: list = [View(), View()]
+    low, high = depth_range(poses, nothing.points, nothing.sees(len(poses)), (0, 1), views)
+    assert (low, high) == (pytest.approx(0.5), pytest.approx(9.0))

@@ -100,7 +100,7 @@ def run_mesh(tmp_path, progress, monkeypatch):
             path.mkdir(exist_ok=True)
         write_json(inputs["normalise"] / "scene.json", (scene or scene_around()).to_json())
         write_tensors(inputs["normalise"] / "points.safetensors", {"xyz": points})
-        info = {"rays": 1000, "effects": learnt or {}}
+        info = {"rays": 1000, "effects": learnt or {}, "settings": {"space": {"kind": "box"}}}
         write_json(inputs["train"] / "field.json", info)
         write_json(inputs["scale"] / "scale.json", {"metres_per_unit": metres})
         monkeypatch.setattr(extraction, "load_field", lambda *_: (model, info))

@@ -7,6 +7,7 @@ import pytest
 
 from nerf.geometry.camera_paths import look_at
 from nerf.geometry.scene import Camera, Scene, Similarity, View
+from nerf.geometry.space_maps import Box
 from stages.mesh.files import ColouredMesh
 from stages.mesh.preview import ELEVATION, SMALL_FACES, preview, small_copy, viewpoints
 
@@ -95,7 +96,7 @@ def terrain(side: int) -> ColouredMesh:
 
 def test_the_copy_that_turns_is_small_and_the_same_shape():
     mesh = terrain(160)
-    small = small_copy(mesh)
+    small = small_copy(mesh, Box())
     assert small is not None and 0.8 * SMALL_FACES < len(small["faces"]) <= SMALL_FACES
     assert sum(part.nbytes for part in small.values()) < 300_000
     back = small["positions"] / 32767 * small["radius"] + small["middle"]
@@ -109,4 +110,6 @@ def test_the_copy_that_turns_is_small_and_the_same_shape():
 def test_a_mesh_that_is_all_borders_has_no_copy():
     mesh = terrain(120)
     loose = mesh._replace(vertices=mesh.vertices[mesh.faces.ravel()], colours=mesh.colours[mesh.faces.ravel()])
-    assert small_copy(loose._replace(faces=np.arange(3 * len(mesh.faces), dtype=np.int32).reshape(-1, 3))) is None
+    assert (
+        small_copy(loose._replace(faces=np.arange(3 * len(mesh.faces), dtype=np.int32).reshape(-1, 3)), Box()) is None
+    )

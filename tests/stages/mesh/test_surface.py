@@ -8,6 +8,7 @@ import torch
 from skimage.measure import marching_cubes
 
 from nerf.fields.density_grid import DensityGrid, occupancy
+from nerf.geometry.space_maps import Box, Ndc
 from stages.mesh.decimation import decimate
 from stages.mesh.marching_cubes import extract_surface
 from stages.mesh.surface import (
@@ -153,25 +154,41 @@ def test_what_decimation_folds_onto_itself_goes_and_nothing_opens(monkeypatch):
     for faces in (TETRAHEDRON.faces, slivers):
         given = vertices, np.concatenate([folded, faces])
         monkeypatch.setattr("fast_simplification.simplify", lambda *_, given=given, **__: given)
-        fewer = decimate(Surface(*given), 5)
+        fewer = decimate(Surface(*given), 5, Box())
         assert len(fewer.faces) == len(faces) and is_watertight(fewer)
 
 
 def test_decimation_keeps_the_shape_closed():
     surface = extract_surface(density_grid_of(torus), LEVEL)
-    fewer = decimate(surface, len(surface.faces) // 4)
+    fewer = decimate(surface, len(surface.faces) // 4, Box())
     assert 0.2 < len(fewer.faces) / len(surface.faces) <= 0.25
     assert is_watertight(fewer) and euler(fewer) == 0
     assert 0 < abs(volume(fewer) / volume(surface) - 1) < 0.01
-    assert decimate(surface, len(surface.faces)) is surface
+    assert decimate(surface, len(surface.faces), Box()) is surface
 
 
 def test_decimation_leaves_borders_where_they_are():
     surface = extract_surface(density_grid_of(lambda p: p[..., 2] + 0.2 * p[..., 0].cos()), LEVEL)
-    fewer = decimate(surface, len(surface.faces) // 3)
+    fewer = decimate(surface, len(surface.faces) // 3, Box())
     assert len(fewer.faces) < len(surface.faces) / 2
     before, after = (np.unique(border_vertices(s).round(9), axis=0) for s in (surface, fewer))
     np.testing.assert_array_equal(before, after)
+
+
+def test_what_is_near_keeps_its_faces_where_cameras_face_one_way():
+    """Two balls, the far one three times as large, so that both are alike in the photos."""
+    space = Ndc((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (1.0, 1.0), 0.1)
+    near = extract_surface(density_grid_of(ball), LEVEL)
+    small = near.vertices / 6
+    vertices = np.concatenate([small + np.array([0, 0, 0.3]), 3 * small + np.array([0, 0, 0.9])])
+    both = Surface(vertices, np.concatenate([near.faces, near.faces + len(small)]))
+
+    def share_of_near(of_space):
+        fewer = decimate(both, len(both.faces) // 6, of_space)
+        return (fewer.vertices[fewer.faces].mean(axis=1)[:, 2] < 0.45).mean()
+
+    assert share_of_near(Box()) < 0.4
+    assert share_of_near(space) == pytest.approx(0.5, abs=0.05)
 
 
 def test_samples_lie_on_the_surface_and_are_uniform_by_area():

@@ -75,13 +75,13 @@ def seen_points(view):
 def shoot(tmp_path):
     """Write photos of the plane: ``change(index, colours, points)`` may alter what one shows; the scene of them."""
 
-    def write(change=lambda index, colours, points: colours, some=None, masks=()):
+    def write(change=lambda index, colours, points: colours, some=None, masks=(), alpha=None):
         taken, photos = some or views(), []
         for index, view in enumerate(taken):
             points = seen_points(view)
             colours = change(index, pattern(points), points)
             pixels = np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8).reshape(SIDE, SIDE, 3)
-            write_png(tmp_path / view.file, pixels)
+            write_png(tmp_path / view.file, pixels if alpha is None else np.dstack([pixels, alpha]))
             photos.append(Photo(view.name, view.file, SIDE, SIDE, 0, None, None, False, 1.0))
         for index, mask in masks:
             write_png(tmp_path / f"masks/{index}.png", mask)
@@ -165,6 +165,31 @@ def test_masked_pixels_are_never_used(shoot, baked):
     assert (np.abs(colours - magenta).max(axis=1) > 0.2).all()
     unmasked = baked(sheet(), shoot(left_is_magenta, views(1)))[1]
     assert (np.abs(unmasked - magenta).max(axis=1) < 0.1).mean() > 0.2
+
+
+@pytest.mark.parametrize(("has_alpha", "unseen"), [(True, 0.5), (False, 0.0)])
+def test_alpha_counts_where_it_says_what_is_background(has_alpha, unseen, shoot, baked):
+    """A soft matte is 250 where it is opaque; alpha that trained as part of no background is none here, either."""
+    matte = np.full((SIDE, SIDE), 250, np.uint8)
+    matte[:, : SIDE // 2] = 0
+
+    def left_is_magenta(index, colours, points):
+        left = np.tile(np.arange(SIDE) < SIDE // 2, SIDE)
+        return np.where(left[:, None] & has_alpha, [1.0, 0, 1], colours)
+
+    taken = replace(shoot(left_is_magenta, views(1), alpha=matte), has_alpha=has_alpha)
+    _, colours, found = baked(sheet(), taken)
+    assert found.unseen == pytest.approx(unseen, abs=0.2)
+    assert (np.abs(colours - [1.0, 0, 1]).max(axis=1) > 0.2).all()
+
+
+def test_saturated_surfaces_have_as_many_texels(shoot, baked):
+    def red(_, colours, points):
+        return np.column_stack([np.ones(len(points)), colours[:, 1:]])
+
+    _, _, plain = baked(sheet(), shoot())
+    _, _, saturated = baked(sheet(), shoot(red))
+    assert saturated.texture.atlas.width > 0.9 * plain.texture.atlas.width
 
 
 def test_what_lies_behind_gets_nothing_of_what_hides_it(shoot, baked):

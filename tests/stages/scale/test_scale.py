@@ -124,6 +124,14 @@ def test_a_marker_that_is_wrong_is_named(
     assert [one["problem"] for one in told["references"]] == [problem] and progress.codes == [f"scale.{problem}"]
 
 
+def test_a_photo_that_shows_a_marker_twice_is_left_out(tmp_path: Path, progress: Any) -> None:
+    places, once = photos_of((SEVEN,))
+    _, twice = photos_of((SEVEN, SEVEN._replace(centre=(0.16, 0.0))))
+    told = measured(tmp_path, progress, (places, [twice[0], *once[1:]]), marker=("4X4_50:7=80mm",))
+    assert told["metres_per_unit"] == pytest.approx(units(0.5), rel=0.002) and not progress.notes
+    assert told["references"][0]["photos"] == len(once) - 1
+
+
 def test_a_marker_that_was_moved_is_named(tmp_path: Path, progress: Any) -> None:
     places, here = photos_of((SEVEN,))
     _, there = photos_of((SEVEN._replace(centre=(0.15, 0.1)),))
