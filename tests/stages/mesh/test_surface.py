@@ -176,19 +176,18 @@ def test_decimation_leaves_borders_where_they_are():
 
 
 def test_what_is_near_keeps_its_faces_where_cameras_face_one_way():
-    """Two balls, the far one three times as large, so that both are alike in the photos."""
+    """Two balls, the far one ten times as large: the photos show them alike, and the near one with more parallax."""
     space = Ndc((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (1.0, 1.0), 0.1)
     near = extract_surface(density_grid_of(ball), LEVEL)
     small = near.vertices / 6
-    vertices = np.concatenate([small + np.array([0, 0, 0.3]), 3 * small + np.array([0, 0, 0.9])])
+    vertices = np.concatenate([small + np.array([0, 0, 0.3]), 10 * small + np.array([0, 0, 3.0])])
     both = Surface(vertices, np.concatenate([near.faces, near.faces + len(small)]))
 
     def share_of_near(of_space):
         fewer = decimate(both, len(both.faces) // 6, of_space)
         return (fewer.vertices[fewer.faces].mean(axis=1)[:, 2] < 0.45).mean()
 
-    assert share_of_near(Box()) < 0.4
-    assert share_of_near(space) == pytest.approx(0.5, abs=0.05)
+    assert share_of_near(Box()) < 0.42 and share_of_near(space) > 0.6
 
 
 def test_samples_lie_on_the_surface_and_are_uniform_by_area():
