@@ -7,7 +7,6 @@ from fast_simplification import simplify
 from nerf.geometry.space_maps import SpaceMap
 from stages.mesh.surface import Surface, keep_faces
 
-
 # fast_simplification collapses what costs less than limits that grow from a fixed one. In scene units everything costs
 # less than the first, and edges go in the order of the faces: the error is a tenth larger (docs/experiments/mesh.md).
 SCALE = 100.0
