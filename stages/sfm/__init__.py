@@ -31,7 +31,7 @@ NOT_HASHED = ("max_seconds", "seconds")
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
 Direction = Literal["world-from-camera", "camera-from-world"]
 CameraAxes = Literal["opencv", "opengl"]
-MAX_STRATEGIES = 8  # the default of ``max_strategies``, which is all of them
+MAX_STRATEGIES = 9  # the default of ``max_strategies``, which is all of them
 MAX_DOUBLED_MEGAPIXELS = 0.7  # photos of a longer side of up to 1024 pixels are doubled for feature extraction
 BUDGET_SHARE = 0.5  # of a budget: what it may take before it extracts fewer features
 

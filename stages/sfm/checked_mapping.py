@@ -34,6 +34,7 @@ from stages.sfm.matching import capture_sequence, consecutive_pairs
 from stages.sfm.retry_strategies import STRATEGIES, MappingOptions, Strategy
 
 CALIBRATING_PHOTOS = 40
+MAX_STRAY_FRACTION = 0.05  # of all photos: so few outside the sequence do not say that the scene repeats itself
 MIN_PHOTOS_OF_CAMERA = 10  # in a row, for their camera to be taken for that of all
 
 
@@ -104,6 +105,26 @@ def run_mapping(
             compared["taken"] = found[0] is other
     state.end("mapping")
     return found, checked, compared
+
+
+def register_missing(
+    strategy: Strategy, database: Path, state: JobState
+) -> tuple[list[Any], CheckedModel, dict[str, Any] | None]:
+    """As :func:`run_mapping`, going on from the best model so far, whose missing photos have new matches: as many of
+    them as can be are registered in it."""
+    state.begin("mapping", done=0)
+    best, seed, known = state.usable(), state.job.seed, state.job.camera_params is not None
+    assert best is not None and strategy.mapping is not None, "only of a model are photos missing"
+    model, matches = load_native(state.log.model(best.name)), database
+    if state.thinned:
+        matches = state.sibling("missing-thinned")
+        thin_matches(database, matches, camera_is_known=True)
+    options = incremental_options(seed, strategy.mapping, known, state.thinned, hold_focal=state.thinned)
+    scratch = Path(state.job.folder, "again")
+    model = register_again(model, check_model(model, database, seed), matches, state.images, scratch, options)
+    checked = _checked(model, None, database, matches, options, state, ())
+    state.end("mapping")
+    return [checked.model], checked, best.global_mapping
 
 
 def calibrate_by_few(matches: Path, mapping: MappingOptions, state: JobState) -> bool:
@@ -225,7 +246,8 @@ def _checked(
     best, sequence = (model, check_model(model, database, state.job.seed)), capture_sequence(database, state)
     checks = [best]
     if not fragments_sequence(best[1], sequence):
-        if other is not None and (best[1].failed() or disagree(model, other)):
+        more = other is not None and other.num_reg_images() > model.num_reg_images()
+        if other is not None and (more or best[1].failed() or disagree(model, other)):
             checks.append((other, check_model(other, database, state.job.seed)))
             best = better(*checks)
             if best[0] is other:
@@ -253,8 +275,9 @@ def _checked(
     supported = supported_steps(model, state.database, trusted) if trusted else None
     outside = drop_outside_main_segment(model, checked, sequence, supported)
     excluded = why | outside
+    broken = len(outside) > MAX_STRAY_FRACTION * len(state.photos)
     return CheckedModel(
-        model, excluded, bool(outside), checked.fits, [one for one in checks if not (excluded and one is best)]
+        model, excluded, broken, checked.fits, [one for one in checks if not (excluded and one is best)]
     )
 
 

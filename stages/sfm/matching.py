@@ -58,16 +58,13 @@ def match_photos(strategy: Strategy, missing: list[int], state: JobState) -> tup
     if strategy.matches == "strict":
         _extract(database, ExtractionOptions(job.max_image_size, job.max_features), state)
         graph = _match_all(database, state)
-    elif strategy.matches == "relaxed":
-        database = state.sibling("relaxed")
-        before = matched_pairs(state.latest())
+    elif strategy.matches in ("missing", "relaxed"):
+        database = state.sibling(strategy.matches)
+        before, partners = matched_pairs(state.latest()), 2 * job.neighbours
+        if strategy.matches == "relaxed":  # of many photos: together as many pairs as were matched already
+            partners = max(partners, len(before) // len(missing))
         copy_without_matches_of({state.files[number] for number in missing}, state.latest(), database)
-        _match(
-            database,
-            with_more_pairs(before, missing, job.neighbours, lambda: state.similarity),
-            RELAXED_RATIO,
-            state,
-        )
+        _match(database, with_more_pairs(before, missing, partners, lambda: state.similarity), RELAXED_RATIO, state)
     elif strategy.matches == "consecutive":
         database = state.sibling("consecutive")
         tried, kept = (matched_pairs(state.database) + 1).tolist(), consecutive_pairs(state)

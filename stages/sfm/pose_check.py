@@ -46,8 +46,9 @@ class PairMatches(NamedTuple):
 
     Keypoints are numbered through all photos: ``photo`` says whose each is, ``ray_direction`` is its unit ray in the
     camera's frame (right for every camera model). ``focal_px`` turns angles into pixels, one per photo. ``weight`` is
-    how many verified matches a pair has in all; those listed may be a sample. ``noise_px`` is their usual distance from
-    the epipolar geometry of their two photos alone, which no pose of a model bends; NaN where it is not known.
+    how many verified matches a pair has in all; those listed may be a sample. ``pair_noise_px`` is the median distance
+    of a pair's matches from the epipolar geometry of its two photos alone, which no pose of a model bends; NaN where it
+    is not known.
     """
 
     pairs: Int[np.ndarray, "pairs 2"]
@@ -57,7 +58,13 @@ class PairMatches(NamedTuple):
     photo: Int[np.ndarray, "keypoints"]
     ray_direction: Float[np.ndarray, "keypoints 3"]
     focal_px: Float[np.ndarray, "photos"]
-    noise_px: float = np.nan
+    pair_noise_px: Float[np.ndarray, "pairs"]
+
+    @property
+    def noise_px(self) -> float:
+        """That of half of the pairs; NaN where it is known of none."""
+        known = self.pair_noise_px[np.isfinite(self.pair_noise_px)]
+        return float(np.median(known)) if len(known) else np.nan
 
 
 def transfer_errors_px(
@@ -196,7 +203,7 @@ def check_poses(
             break
         misplaced &= ~cleared
     agrees, contradicts = error <= tolerance, _contradicts(matches, error, tolerance)
-    linked = _matrix(matches, agrees, count)
+    linked = _matrix(matches, _links(matches, error, tolerance), count)
     unlinked = ~misplaced & (connected(np.where(misplaced[:, None] | misplaced[None], 0, linked) > 0) > 0)
     passed = ~(misplaced | unlinked)
     counted = passed[matches.pairs].all(axis=1) & (agrees | (matches.weight >= MIN_PAIR_MATCHES))
@@ -446,6 +453,16 @@ def _contradicts(
     matches: PairMatches, error_px: Float[np.ndarray, "pairs"], tolerance_px: float
 ) -> Bool[np.ndarray, "pairs"]:
     return (error_px > CONTRADICTION_FACTOR * tolerance_px) & (matches.weight >= MIN_PAIR_MATCHES)
+
+
+def _links(
+    matches: PairMatches, error_px: Float[np.ndarray, "pairs"], tolerance_px: float
+) -> Bool[np.ndarray, "pairs"]:
+    """The pairs that agree with the poses, and those that are too inexact to do so and do not contradict them: a
+    blurred photo among sharp ones has no others."""
+    known = np.isfinite(matches.pair_noise_px)
+    own_px = TOLERANCE_FACTOR * np.where(known, matches.pair_noise_px, 0.0)
+    return error_px <= np.clip(own_px, tolerance_px, CONTRADICTION_FACTOR * tolerance_px)
 
 
 def _matrix(matches: PairMatches, chosen: Bool[np.ndarray, "pairs"], count: int) -> Float[np.ndarray, "photos photos"]:

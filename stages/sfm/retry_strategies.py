@@ -13,16 +13,15 @@ from typing import Any, Literal, NamedTuple
 from stages.contract import Note
 from stages.io.files import write_durably
 
-# Another initial pair maps all images anew, new features or a fisheye model cost as much as the first strategy: they
-# wait until so many images are missing. Where the model holds all but a few, initial pair and camera model are right.
-MIN_MISSING_TO_START_OVER = 0.1  # of all; for features and fisheye two at least, since one may well be a stranger
-# Nor is mapping again, minutes of many images, worth a blurred one among them: the others show what it shows.
-MIN_MISSING_TO_RETRY = 0.02
+# Where the model holds all but a few images, initial pair and camera model are right: these few are matched again and
+# registered in it. Mapping all images anew waits until so many are missing, of all; one alone may well be a stranger.
+MIN_MISSING_TO_START_OVER = 0.1
 # Of the photo's longer side: 36 mm in the 35-mm format, where a fisheye of 180 degrees has 16.
 MIN_LONG_FOCAL = 1.0
 # Camera model selection and final bundle adjustment take 0.8 to 1.6 times as long as mapping
 # (docs/experiments/camera_models.md).
 FINAL_ADJUSTMENT_FACTOR = 2.0
+ADDING = 0.4  # of the time of mapping, that a few images take to be registered in its model
 MAX_SECONDS_LIMIT, TIME_GIVEN = "--sfm.max-seconds", "the time it is given (--budget or --sfm.seconds)"
 LOG, ABANDONED = "outcomes.json", "abandoned.json"
 
@@ -49,12 +48,13 @@ OTHER_SEED = MappingOptions(seed_offset=1, hold_focal=False)
 
 
 class Strategy(NamedTuple):
-    """One way to find the cameras. ``matches``: new ones, or those of the best strategy so far ("same"); ``mapping``:
-    the options of incremental mapping, None for global mapping."""
+    """One way to find the cameras. ``matches``: new ones, those of the best strategy so far ("same"), or with new ones
+    of its missing photos ("missing"), whose model is then gone on with; ``mapping``: the options of incremental
+    mapping, None for global mapping."""
 
     name: str
     description: str
-    matches: Literal["strict", "consecutive", "relaxed", "same", "fisheye", "more features"]
+    matches: Literal["strict", "consecutive", "missing", "relaxed", "same", "fisheye", "more features"]
     mapping: MappingOptions | None
 
 
@@ -62,6 +62,12 @@ STRATEGIES = (
     Strategy("default", "", "strict", MappingOptions(structure_less_fallback=True)),
     Strategy(
         "consecutive pairs", "mapping only matches of consecutively taken photos", "consecutive", MappingOptions()
+    ),
+    Strategy(
+        "missing photos",
+        "matching them again with a relaxed ratio test and registering them in the model",
+        "missing",
+        MappingOptions(),
     ),
     Strategy("fisheye", "verifying and mapping again with a fisheye camera model", "fisheye", MappingOptions()),
     Strategy("relaxed ratio test", "matching again with a relaxed ratio test", "relaxed", MappingOptions()),
@@ -75,7 +81,7 @@ STRATEGIES = (
         WEAK_INITIAL_PAIR,
     ),
 )
-STRICT = tuple(strategy.name for strategy in STRATEGIES if strategy.matches not in ("relaxed", "same"))
+STRICT = tuple(strategy.name for strategy in STRATEGIES if strategy.matches not in ("missing", "relaxed", "same"))
 
 
 @dataclass(frozen=True)
@@ -201,6 +207,8 @@ def expected_seconds(strategy: Strategy, outcomes: Sequence[Outcome], missing: f
     """
     first = outcomes[0].seconds
     mapping = max(one.seconds["mapping"] for one in outcomes)
+    if strategy.matches == "missing":
+        return min(1.0, 4 * missing) * first["matching"] + ADDING * mapping
     if strategy.matches == "more features":
         return 4 * (first["features"] + first["matching"]) + 2 * mapping
     # A missing image's pairs are matched again, or where pairs were chosen as many as the first time.
@@ -254,12 +262,15 @@ def reason_against(strategy: Strategy, now: Situation) -> str | None:
         return "the camera model is given"
     if strategy.matches == "fisheye" and now.long_lenses:
         return "no fisheye has focal lengths as long as EXIF tells"
-    if now.missing < MIN_MISSING_TO_RETRY * now.images:
-        return f"mapping again is not worth it for {now.missing} of {now.images} photos"
-    from_nothing = strategy.matches in ("fisheye", "more features")
-    worth = max(2 * from_nothing, MIN_MISSING_TO_START_OVER * now.images)
-    if strategy.matches != "relaxed" and now.missing < worth:
+    worth = MIN_MISSING_TO_START_OVER * now.images
+    if strategy.matches == "missing":
+        too_many = now.missing >= max(2, worth)
+        return f"{now.missing} of {now.images} photos are too many to add to a model" if too_many else None
+    if strategy.matches not in ("consecutive", "same"):  # these cost as much as the first strategy, or nearly
+        worth = max(2, worth)
+    if now.missing < worth:
         return f"starting over is not worth it for {now.missing} of {now.images} photos"
+    from_nothing = strategy.matches in ("fisheye", "more features")
     if from_nothing and not now.linked and now.alone < worth:  # neither camera model nor features are what they lack
         return "the missing photos form models of their own and share too few matches with the others"
     return None

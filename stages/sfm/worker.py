@@ -17,7 +17,7 @@ from stages.contract import Note, StageError
 from stages.hardware import cluster
 from stages.io.amounts import rough_duration
 from stages.io.files import make_durable
-from stages.sfm.checked_mapping import run_mapping
+from stages.sfm.checked_mapping import register_missing, run_mapping
 from stages.sfm.colmap.diagnosis import find_conflict, links, supports
 from stages.sfm.colmap.final_bundle_adjustment import final_bundle_adjustment
 from stages.sfm.colmap.models import load_native, write_native
@@ -196,7 +196,8 @@ def _try(strategy: Strategy, missing: list[int], state: JobState) -> None:
     state.send(strategy=strategy.name)
     state.strategy, state.seconds = strategy.name, {}
     database, match_graph = match_photos(strategy, missing, state)
-    models, checked, compared = run_mapping(strategy, database, state)
+    adding, before = strategy.matches == "missing", state.usable()
+    models, checked, compared = (register_missing if adding else run_mapping)(strategy, database, state)
     outcome = Outcome(strategy.name, database.name, seconds=state.seconds, match_graph=match_graph)
     if models:
         folder = state.log.model(strategy.name)
@@ -213,6 +214,15 @@ def _try(strategy: Strategy, missing: list[int], state: JobState) -> None:
             fits=checked.fits,
             global_mapping=compared,
         )
+        if adding and before:  # its other sub-models are as they were
+            still_excluded = {name: why for name, why in before.excluded.items() if name not in outcome.groups[0]}
+            outcome = replace(
+                outcome,
+                groups=[outcome.groups[0], *before.groups[1:]],
+                match_graph=before.match_graph,
+                conflict=before.conflict,
+                excluded=still_excluded | checked.excluded,
+            )
     state.log.add(outcome)
 
 

@@ -57,8 +57,9 @@ def read_pair_matches(
         if most and len(inliers) > most:
             inliers = inliers[random.choice(len(inliers), most, replace=False)]
         keypoints.append(inliers)
-        if geometry.F is not None and len(inliers) >= MIN_PAIR_MATCHES:
-            noise.append(_epipolar_px(geometry.F, xy[first][inliers[:, 0]], xy[second][inliers[:, 1]]))
+        known = geometry.F is not None and len(inliers) >= MIN_PAIR_MATCHES
+        ends = xy[first][inliers[:, 0]], xy[second][inliers[:, 1]]
+        noise.append(_epipolar_px(geometry.F, *ends) if known else np.nan)
     directions = [_directions(xy[image_id], model.camera(model.image(image_id).camera_id)) for image_id in ids]
     begins = np.concatenate([[0], np.cumsum([len(some) for some in directions])]).astype(int)
     rows = [some + begins[list(pair)] for some, pair in zip(keypoints, pairs, strict=True)]
@@ -70,7 +71,7 @@ def read_pair_matches(
         photo=np.repeat(np.arange(len(ids)), np.diff(begins)),
         ray_direction=np.concatenate([np.zeros((0, 3)), *directions]),
         focal_px=np.array([model.camera(model.image(i).camera_id).mean_focal_length() for i in ids]),
-        noise_px=float(np.median(noise)) if noise else np.nan,
+        pair_noise_px=np.array(noise, float),
     )
 
 

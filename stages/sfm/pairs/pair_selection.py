@@ -129,16 +129,13 @@ def start_pairs(
 
 
 def with_more_pairs(
-    pairs: Pairs, missing: Sequence[int], neighbours: int, similarity: Callable[[], SimilarityMatrix]
+    pairs: Pairs, missing: Sequence[int], partners: int, similarity: Callable[[], SimilarityMatrix]
 ) -> Pairs:
-    """The pairs again, and more for unregistered photos: as many as were matched already, at most all.
-
-    They go to each missing photo's most similar ones, and are at least twice as many as it had.
-    """
-    count, each = int(pairs.max(initial=0)) + 1, max(2 * neighbours, len(pairs) // max(1, len(missing)))
+    """The pairs again, and those of unregistered photos with so many ``partners`` each, the most similar ones."""
+    count = int(pairs.max(initial=0)) + 1
     if len(pairs) == count * (count - 1) // 2:
         return pairs
-    order = np.argsort(-similarity()[list(missing)], axis=1, kind="stable")[:, : each + 1]  # itself is one of them
+    order = np.argsort(-similarity()[list(missing)], axis=1, kind="stable")[:, : partners + 1]  # itself is one of them
     return union(pairs, np.stack([np.repeat(missing, order.shape[1]), order.reshape(-1)], axis=1))
 
 

@@ -53,6 +53,7 @@ def walk(photos: int = 30, points: int = 1500, noise_px: float = 0.4, reach: int
         photo=np.repeat(np.arange(photos), np.diff(begins)),
         ray_direction=ray_direction / np.linalg.norm(ray_direction, axis=1, keepdims=True),
         focal_px=np.full(photos, FOCAL_PX),
+        pair_noise_px=np.full(len(pairs), np.nan),
     ), poses
 
 
@@ -142,6 +143,23 @@ def test_a_photo_that_no_pair_agrees_with_is_unlinked() -> None:
     assert np.flatnonzero(check.unlinked).tolist() == [last] and not check.misplaced.any()
 
 
+def test_a_blurred_photo_is_linked_by_inexact_pairs() -> None:
+    """All of its pairs are off, by no more than their own matches are from any geometry."""
+    matches, poses = walk()
+    random, blurred = np.random.default_rng(3), 12
+    ray = matches.ray_direction.copy()
+    mine = matches.photo == blurred
+    ray[mine] += random.normal(0, 2.2 / FOCAL_PX, (mine.sum(), 3)) * [1, 1, 0]
+    of_it = (matches.pairs == blurred).any(axis=1)
+    matches = matches._replace(ray_direction=ray / np.linalg.norm(ray, axis=1, keepdims=True))
+    sharp = check_poses(matches, poses)
+    error = sharp.pair_error_px[of_it]
+    assert (error > sharp.tolerance_px).all() and (error < CONTRADICTION_FACTOR * sharp.tolerance_px).all()
+    assert np.flatnonzero(sharp.unlinked).tolist() == [blurred]
+    known = check_poses(matches._replace(pair_noise_px=np.where(of_it, 1.5, 0.4)), poses)
+    assert known.passed.all()
+
+
 def test_a_single_pair_across_is_a_weak_link() -> None:
     matches, poses = walk()
     across = (matches.pairs[:, 0] < 7) & (matches.pairs[:, 1] >= 7)
@@ -172,6 +190,7 @@ def test_chance_matches_cut_off_no_photo() -> None:
         weight=np.concatenate([matches.weight, np.full(4, 20.0)]),
         pair=np.concatenate([matches.pair, np.repeat(len(matches.pairs) + np.arange(4), 20)]),
         keypoint=np.concatenate([matches.keypoint, *chance]),
+        pair_noise_px=np.concatenate([matches.pair_noise_px, np.full(4, np.nan)]),
     )
     check = check_poses(matches, poses)
     assert check.passed.all() and not check.contradicts.any() and check.agrees[held]
@@ -257,6 +276,7 @@ def restricted(matches: PairMatches, kept: np.ndarray) -> PairMatches:
         weight=matches.weight[kept],
         pair=number[matches.pair[of]],
         keypoint=matches.keypoint[of],
+        pair_noise_px=matches.pair_noise_px[kept],
     )
 
 
@@ -271,7 +291,7 @@ def test_photos_in_one_position_are_checked_by_rotation() -> None:
 def test_nothing_to_compare_is_no_evidence() -> None:
     none = PairMatches(
         np.zeros((0, 2), int), np.zeros(0), np.zeros(0, int), np.zeros((0, 2), int), np.zeros(0, int),
-        np.zeros((0, 3)), np.ones(3),
+        np.zeros((0, 3)), np.ones(3), np.zeros(0),
     )  # fmt: skip
     check = check_poses(none, np.tile(np.eye(3, 4), (3, 1, 1)))
     assert not check.misplaced.any() and check.unlinked.sum() == 2

@@ -79,6 +79,7 @@ TIMED = [
         ("fisheye", False, 40 + 30),
         ("relaxed ratio test", False, 0.75 * 40 + 30),  # of all pairs, three quarters have one of half of the photos
         ("relaxed ratio test", True, 40 + 30),
+        ("missing photos", True, 40 + 0.4 * 30),
         ("weaker initial pair", False, 30),
         ("global mapping", True, 30),
         ("more features", False, 4 * (10 + 40) + 2 * 30),
@@ -111,7 +112,7 @@ def test_strategies_skipped_for_time_are_counted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "broken"),
-    [("default", True), ("more features", True), ("relaxed ratio test", False), ("other seed", False)],
+    [("default", True), ("more features", True), ("relaxed ratio test", False), ("missing photos", False)],
 )
 def test_only_strict_matches_break_a_sequence(name: str, broken: bool, tmp_path: Path) -> None:
     log = StrategyLog(tmp_path / "strategies")
@@ -133,8 +134,14 @@ APART = "form models of their own"
         ("weaker initial pair", {"missing": 4}, "starting over is not worth it for 4 of 50"),
         ("other seed", {"missing": 9, "images": 300}, "starting over is not worth it for 9 of 300"),
         ("global mapping", {"missing": 9, "images": 300}, "starting over is not worth it for 9 of 300"),
-        ("relaxed ratio test", {"missing": 9, "images": 300}, None),
+        ("relaxed ratio test", {"missing": 9, "images": 300}, "starting over is not worth it for 9 of 300"),
+        ("missing photos", {"missing": 1, "images": 300}, None),
+        ("missing photos", {"missing": 29, "images": 300}, None),
+        ("missing photos", {"missing": 30, "images": 300}, "30 of 300 photos are too many"),
+        ("missing photos", {"missing": 1, "images": 8}, None),
+        ("missing photos", {"missing": 1, "sequence_broken": True}, "repeated structure"),
         ("other seed", {"missing": 1, "images": 8}, None),
+        ("relaxed ratio test", {"missing": 1, "images": 8}, "starting over is not worth it for 1 of 8"),
         ("weaker initial pair", {"planar": True}, "no depth"),
         ("global mapping", {"linked": False}, TOO_LITTLE),
         ("relaxed ratio test", {"missing": 150, "alone": 0, "images": 300, "linked": False}, None),
@@ -147,9 +154,8 @@ APART = "form models of their own"
         ("fisheye", {"missing": 40, "long_lenses": True}, "no fisheye has"),
         ("relaxed ratio test", {"missing": 40, "long_lenses": True}, None),
         ("fisheye", {"missing": 4}, "starting over is not worth it for 4 of 50"),
-        ("weaker initial pair", {"missing": 1, "images": 51}, "mapping again is not worth it for 1 of 51"),
-        ("relaxed ratio test", {"missing": 5, "images": 300}, "mapping again is not worth it for 5 of 300"),
-        ("relaxed ratio test", {"missing": 6, "images": 300}, None),
+        ("weaker initial pair", {"missing": 1, "images": 51}, "starting over is not worth it for 1 of 51"),
+        ("relaxed ratio test", {"missing": 30, "images": 300}, None),
         ("more features", {"linked": False, "camera_model_is_given": True}, None),
         ("more features", {"missing": 4}, "starting over is not worth it for 4 of 50"),
         ("more features", {"missing": 1, "images": 8}, "starting over is not worth it for 1 of 8"),

@@ -27,5 +27,6 @@ def ring() -> tuple[PairMatches, np.ndarray]:
         photo=np.repeat(np.arange(PHOTOS), 60),
         ray_direction=(rays / np.linalg.norm(rays, axis=2, keepdims=True)).reshape(-1, 3),
         focal_px=np.full(PHOTOS, FOCAL_PX),
+        pair_noise_px=np.full(len(pairs), np.nan),
     )
     return matches, poses

@@ -170,14 +170,14 @@ def test_where_positions_tell_nothing_looks_choose_half_of_the_partners(error_m:
     assert sum(map(len, found)) <= 2 * 120 * 30
 
 
-def test_a_second_selection_doubles_the_pairs_of_missing() -> None:
+def test_missing_photos_get_the_partners_asked_for() -> None:
     alike = similarity(40)
     pairs = nearest(alike, 4)
-    again = with_more_pairs(pairs, [3, 17], 4, lambda: alike)
+    again = with_more_pairs(pairs, [3, 17], 12, lambda: alike)
     assert {*map(tuple, pairs.tolist())} < {*map(tuple, again.tolist())}
     assert all(3 in pair or 17 in pair for pair in {*map(tuple, again.tolist())} - {*map(tuple, pairs.tolist())})
-    assert partners(again, 40)[3] == set(range(40)) - {3}  # each may have half of more than 80 pairs
-    everyone = with_more_pairs(pairs, list(range(40)), 4, lambda: alike)
+    assert 12 <= len(partners(again, 40)[3]) <= 14
+    everyone = with_more_pairs(pairs, list(range(40)), 8, lambda: alike)
     assert min(map(len, partners(everyone, 40))) >= 8
     np.testing.assert_array_equal(with_more_pairs(exhaustive(9), [2], 4, unused), exhaustive(9))
 
