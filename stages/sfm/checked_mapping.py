@@ -31,7 +31,7 @@ from stages.sfm.colmap.repair import (
 from stages.sfm.colmap.thinning import MAX_EXIF_RATIO, best_linked, far_apart, thin_matches
 from stages.sfm.job import JobState
 from stages.sfm.matching import capture_sequence, consecutive_pairs
-from stages.sfm.retry_strategies import STRATEGIES, MappingOptions, Strategy
+from stages.sfm.retry_strategies import MIN_MISSING_TO_START_OVER, STRATEGIES, MappingOptions, Strategy
 
 CALIBRATING_PHOTOS = 40
 MAX_STRAY_FRACTION = 0.05  # of all photos: so few outside the sequence do not say that the scene repeats itself
@@ -246,8 +246,7 @@ def _checked(
     best, sequence = (model, check_model(model, database, state.job.seed)), capture_sequence(database, state)
     checks = [best]
     if not fragments_sequence(best[1], sequence):
-        more = other is not None and other.num_reg_images() > model.num_reg_images()
-        if other is not None and (more or best[1].failed() or disagree(model, other)):
+        if other is not None and (_has_nearly_all(other, model, state) or best[1].failed() or disagree(model, other)):
             checks.append((other, check_model(other, database, state.job.seed)))
             best = better(*checks)
             if best[0] is other:
@@ -279,6 +278,13 @@ def _checked(
     return CheckedModel(
         model, excluded, broken, checked.fits, [one for one in checks if not (excluded and one is best)]
     )
+
+
+def _has_nearly_all(other: Any, model: Any, state: JobState) -> bool:
+    """Whether it has more images than the model and lacks only a few: of a model that lacks many, all that these lack
+    is looked for again."""
+    missing = len(state.photos) - other.num_reg_images()
+    return other.num_reg_images() > model.num_reg_images() and missing < MIN_MISSING_TO_START_OVER * len(state.photos)
 
 
 def _passing(candidate: Candidate) -> int:
