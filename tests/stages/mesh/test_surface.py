@@ -175,7 +175,7 @@ def test_decimation_leaves_borders_where_they_are():
     np.testing.assert_array_equal(before, after)
 
 
-def test_what_is_near_keeps_its_faces_where_cameras_face_one_way():
+def test_near_things_keep_faces_in_normalised_device_coordinates():
     """Two balls, the far one ten times as large: the photos show them alike, and the near one with more parallax."""
     space = Ndc((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (1.0, 1.0), 0.1)
     near = extract_surface(density_grid_of(ball), LEVEL)
