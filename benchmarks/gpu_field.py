@@ -111,7 +111,7 @@ def score(field: HashGridField, dataset: RayDataset) -> dict[str, float]:
     def psnr_of(view: int) -> float:
         pixels = torch.arange(int(dataset.first_pixel[view]), int(dataset.first_pixel[view + 1]), device=DEVICE)
         rays, colour, alpha, _ = dataset.lookup(pixels)
-        whole = Rays(*(part.reshape(-1, int(dataset.view_layout[1, view]), *part.shape[1:]) for part in rays))
+        whole = Rays(*(part.reshape(-1, int(dataset.width[view]), *part.shape[1:]) for part in rays))
         seen = render_image(field, whole, white).colour.clamp(0, 1)
         return psnr(mean_squared_error(seen, composite_over(colour, alpha, white).view_as(seen)))
 

@@ -18,7 +18,7 @@ from nerf.geometry.near_far import NEAR_MARGIN
 from nerf.geometry.space_maps import SpaceMap
 from nerf.kernels.torch.occupancy import cell_corners, grown
 from nerf.runtime.parallel import in_order
-from nerf.training.ray_dataset import RayDataset
+from nerf.training.ray_dataset import CENTRE, NEAR_AND_FAR, ROTATION, RayDataset
 
 SIDE = 64  # coarse cells along an edge of the unit cube
 EDGE_PIXELS = 16  # along each side of a photo, from which its field of view is known
@@ -72,9 +72,9 @@ def _looked_at(
 ) -> tuple[Bool[Tensor, "points"], Bool[Tensor, "points"]]:
     """Which points a photo may show between near and far, and which of these are no nearer than its foreground."""
     geometry = dataset.view_geometry[:, view]
-    from_scene, centre, near, far = geometry[:9].view(3, 3).T, geometry[9:12, None], geometry[12], geometry[13]
+    from_scene, (near, far) = geometry[ROTATION].view(3, 3).T, geometry[NEAR_AND_FAR]
     field = _angles(from_scene @ _spread_directions(dataset, view).T)
-    local = from_scene @ (points - centre)
+    local = from_scene @ (points - geometry[CENTRE, None])
     angles, distance = _angles(local), local.square().sum(0).sqrt()
     inside = (angles >= field.amin(1, keepdim=True)) & (angles <= field.amax(1, keepdim=True))
     seen = inside.all(0) & (distance >= near) & (distance <= far)
@@ -90,7 +90,7 @@ def _angles(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "2 n"]:
 def _spread_directions(dataset: RayDataset, view: int) -> Float[Tensor, "rays 3"]:
     """Of EDGE_PIXELS² rays of a photo, those of its corners among them."""
     first, end = dataset.first_pixel[view : view + 2].tolist()
-    width = int(dataset.view_layout[1, view])
+    width = int(dataset.width[view])
     share = torch.linspace(0, 1, EDGE_PIXELS, dtype=torch.float64, device=dataset.device)
     row, column = (((n - 1) * share).round().long() for n in ((end - first) // width, width))
     return dataset.rays((first + width * row[:, None] + column).flatten())[0].directions

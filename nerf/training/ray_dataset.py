@@ -23,6 +23,8 @@ from nerf.geometry.rays import Rays
 # Ray directions are scaled to the plane z = 1, where those of a camera without distortion are linear in the pixel.
 # Beyond 60 degrees from the axis, where that plane is too far away, they keep a bounded length.
 MIN_FORWARD = 0.5
+# Rows of RayDataset.view_geometry.
+ROTATION, CENTRE, NEAR_AND_FAR, PATCHES_PER_PIXEL = slice(0, 9), slice(9, 12), slice(12, 14), slice(14, 16)
 
 
 class PixelBatch(NamedTuple):
@@ -53,8 +55,8 @@ class RayDataset(NamedTuple):
     premultiplied) alpha. What a look-up needs of a view stands in two tables with a column per view:
 
     * ``view_layout``: its first pixel, its width, its camera's first patch, patches in a row;
-    * ``view_geometry``: the rotation scene_from_camera row by row, the centre, near, far, patches per pixel along x and
-    y.
+    * ``view_geometry``: the ROTATION scene_from_camera row by row, the CENTRE, near and far, PATCHES_PER_PIXEL along x
+      and y.
 
     ``patches`` has a column per patch: the direction in its middle, and how it changes along x and y over one patch.
 
@@ -83,7 +85,12 @@ class RayDataset(NamedTuple):
     @property
     def near(self) -> Float[Tensor, "views"]:
         """Per view, where rays begin."""
-        return self.view_geometry[12]
+        return self.view_geometry[NEAR_AND_FAR][0]
+
+    @property
+    def width(self) -> Int[Tensor, "views"]:
+        """Per view, pixels in a row of its photo."""
+        return self.view_layout[1]
 
     @property
     def viewing_distance(self) -> Float[Tensor, "views"] | None:
@@ -123,9 +130,8 @@ class RayDataset(NamedTuple):
         Left out are pixels that may not be drawn (so give the masks first), those that are not wholly opaque, whose
         light ends in part elsewhere, and distances that are not between near and far of their views: no sample stands
         there, and what does would be pulled to the end of the ray."""
-        near, far = self.view_geometry[12:].index_select(
-            1, torch.searchsorted(self.first_pixel, pixel, right=True) - 1
-        )[:2]
+        view = torch.searchsorted(self.first_pixel, pixel, right=True) - 1
+        near, far = self.view_geometry[NEAR_AND_FAR].index_select(1, view)
         kept = self.is_unmasked(pixel) & (near < sparse_depths) & (sparse_depths < far)
         if self.pixels.shape[1] == 4:
             kept &= self.pixels.index_select(0, pixel)[:, 3] == 255
@@ -165,7 +171,7 @@ class RayDataset(NamedTuple):
         within = pixel - first_pixel
         row, column = (2 * (within // width) + 1) * down // (2 * height), (2 * (within % width) + 1) * across
         distance = self.depth_maps.distance.index_select(0, first + row * across + column // (2 * width))
-        near, far = self.view_geometry[12:14].index_select(1, view)
+        near, far = self.view_geometry[NEAR_AND_FAR].index_select(1, view)
         return distance * ((near < distance) & (distance < far))
 
     def lookup(self, pixel: Int[Tensor, "rays"]) -> PixelBatch:
@@ -178,11 +184,10 @@ class RayDataset(NamedTuple):
         """The rays through pixels, and whose views they are; the photos, which may be on disk, are not read."""
         view = torch.searchsorted(self.first_pixel, pixel, right=True).sub_(1)
         view_geometry = self.view_geometry.index_select(1, view)
-        direction = self._direction(pixel, self.view_layout.index_select(1, view), view_geometry[14:])
-        directions = (view_geometry[:9].view(3, 3, -1) * direction).sum(1)
-        return Rays(
-            view_geometry[9:12].T.contiguous(), directions.T.contiguous(), view_geometry[12], view_geometry[13]
-        ), view
+        direction = self._direction(pixel, self.view_layout.index_select(1, view), view_geometry[PATCHES_PER_PIXEL])
+        directions = (view_geometry[ROTATION].view(3, 3, -1) * direction).sum(1)
+        near, far = view_geometry[NEAR_AND_FAR]
+        return Rays(view_geometry[CENTRE].T.contiguous(), directions.T.contiguous(), near, far), view
 
     def _direction(
         self, pixel: Int[Tensor, "rays"], view_layout: Int[Tensor, "4 rays"], per_pixel: Float[Tensor, "2 rays"]
@@ -194,8 +199,8 @@ class RayDataset(NamedTuple):
         x, y = (within - row * width + 0.5) * per_pixel[0], (row + 0.5) * per_pixel[1]  # in patches
         column, line = x.long(), y.long()
         u, v = x.sub_(column).sub_(0.5), y.sub_(line).sub_(0.5)
-        patch = self.patches.index_select(1, first_patch + line * across + column)
-        direction = torch.addcmul(torch.addcmul(patch[:3], patch[3:6], u), patch[6:], v)
+        middle, along_x, along_y = self.patches.index_select(1, first_patch + line * across + column).view(3, 3, -1)
+        direction = torch.addcmul(torch.addcmul(middle, along_x, u), along_y, v)
         return direction / direction.square().sum(0).sqrt_()
 
     def sample_pixels(self, count: int, generator: torch.Generator) -> Int[Tensor, "rays"]:
@@ -220,9 +225,10 @@ class RayDataset(NamedTuple):
         """Whether no mask excludes these pixels."""
         if self.runs is None:
             return torch.ones_like(pixel, dtype=torch.bool)
-        run = torch.searchsorted(self.runs[1].contiguous(), pixel.flatten(), right=True).sub_(1).clamp_(min=0)
-        into = pixel.flatten() - self.runs[1, run]
-        return ((into >= 0) & (into < self.runs[0].diff()[run])).view(pixel.shape)
+        before, first = self.runs
+        run = torch.searchsorted(first.contiguous(), pixel.flatten(), right=True).sub_(1).clamp_(min=0)
+        into = pixel.flatten() - first[run]
+        return ((into >= 0) & (into < before.diff()[run])).view(pixel.shape)
 
 
 class PosedViews(NamedTuple):

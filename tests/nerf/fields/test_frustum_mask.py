@@ -18,7 +18,7 @@ from nerf.kernels import torch as reference
 from nerf.kernels.torch.marching import unit_coordinates
 from nerf.kernels.torch.occupancy import cell_corners, cell_numbers, grown, is_occupied
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
-from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
+from nerf.training.ray_dataset import CENTRE, ROTATION, RayDataset, ray_dataset_from_images
 
 SIZE, HALF = 12, 0.5  # pixels of a photo, and half its width at a distance of one
 NEAR, FAR = 1.0, 40.0
@@ -65,7 +65,7 @@ def projected(views: RayDataset, points: torch.Tensor, near: float, half: float)
     """How many photos have the points in their picture, between ``near`` and far."""
     photos = torch.zeros(len(points), dtype=torch.int32)
     for geometry in views.view_geometry.T:
-        local = (points - geometry[9:12]) @ geometry[:9].view(3, 3)
+        local = (points - geometry[CENTRE]) @ geometry[ROTATION].view(3, 3)
         inside = (local[:, :2].abs() <= half * (1 - 1 / SIZE) * local[:, 2:]).all(-1) & (local[:, 2] > 0)
         distance = local.norm(dim=-1)
         photos += (inside & (distance > near) & (distance < FAR)).int()

@@ -21,6 +21,7 @@ from nerf.kernels import torch as reference
 from nerf.runtime.ranks import Ranks, leave, packed, packed_bytes, unpacker
 from nerf.training.data_parallel import LeadingTrainer, end_others, follow_first_rank
 from nerf.training.hash_grid_trainer import HashGridTrainer
+from nerf.training.ray_dataset import CENTRE
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite
 from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, same, small_dataset
 
@@ -59,7 +60,7 @@ def other_rank(port: int, kind: str) -> None:
     def make(number: int) -> HashGridTrainer:
         made = case(number, device)
         if number == BROKEN:
-            made.dataset.view_geometry[9:12] = float("nan")
+            made.dataset.view_geometry[CENTRE] = float("nan")
         return made
 
     ranks = Ranks.join(TCPStore("127.0.0.1", port, is_master=False), 1, 2, device)

@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 
 from nerf.training.evaluation_pixels import evaluate, sample_evaluation_pixels
 from nerf.training.hash_grid_trainer import HashGridTrainer
-from nerf.training.ray_dataset import RayDataset
+from nerf.training.ray_dataset import CENTRE, NEAR_AND_FAR, ROTATION, RayDataset
 from nerf.training.vanilla_trainer import VanillaTrainer
 from stages import train
 from stages.contract import StageError, StageResult, run_stage
@@ -127,10 +127,10 @@ def test_weights_that_the_last_update_broke_are_never_kept(
 
 # Of the dataset: near and far, the cameras' places, their rotations; and how ray directions change from pixel to pixel.
 ROWS = {
-    "near": ("view_geometry", 12),
-    "far": ("view_geometry", 13),
-    "centres": ("view_geometry", 9),
-    "rotations": ("view_geometry", 4),
+    "near": ("view_geometry", NEAR_AND_FAR.start),
+    "far": ("view_geometry", NEAR_AND_FAR.stop - 1),
+    "centres": ("view_geometry", CENTRE.start),
+    "rotations": ("view_geometry", ROTATION.start + 4),
 }
 ROWS["ray_directions"] = ("patches", 1)
 
