@@ -21,7 +21,7 @@ from nerf.geometry.rays import Rays
 from nerf.geometry.space_maps import Box, SpaceMap
 from nerf.geometry.space_maps.mapped_rays import MappedRays
 from nerf.geometry.space_maps.ndc import Ndc
-from nerf.kernels import BOX, Backend, BinaryOccupancy, GridLayout, RayStepping, Samples, grid_layout
+from nerf.kernels import Backend, BinaryOccupancy, GridLayout, RayStepping, Samples, grid_layout
 from nerf.kernels.torch.occupancy import binary_occupancy, cell_numbers, is_occupied
 from nerf.rendering.early_termination import EARLY_STOP_TRANSMITTANCE, MarchingRound, march_with_early_termination
 from nerf.runtime.profiler import WorkCounts, span
@@ -106,7 +106,7 @@ class HashGridSettings:
             return RayStepping(
                 self.min_step_size, self.cone_angle, True, self.occupancy_resolution, self.max_samples_per_ray
             )
-        step = 2 * BOX * math.sqrt(3) / self.diagonal_steps
+        step = 2 * self.space.half * math.sqrt(3) / self.diagonal_steps
         return RayStepping(step, 0.0, False, self.occupancy_resolution, self.max_samples_per_ray)
 
     @property

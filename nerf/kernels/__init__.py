@@ -24,13 +24,10 @@ from typing import NamedTuple, Protocol, runtime_checkable
 from jaxtyping import Float, Float64, Int, Int32, Int64, UInt8
 from torch import Tensor
 
-from nerf import REGION_HALF_SIZE
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 
-BOX = REGION_HALF_SIZE  # half the side of the cube that a bounded scene fills
 ROW_ALIGNMENT = 4  # of four features: a cache line, and a whole number of vectors for Adam
-CONTRACTED_BOX = 2.0  # half the side of the contracted space
 
 
 class GridLayout(NamedTuple):

@@ -12,17 +12,16 @@ from torch import Tensor
 from nerf.effects import NO_EFFECTS, Effect, ImageEffects, RayGradients, RenderedRays, parameters_of
 from nerf.fields import mlp
 from nerf.fields.background import BACKGROUND_LR_SCALE, BACKGROUND_PRIOR
-from nerf.fields.frustum_mask import compute_frustum_mask
 from nerf.fields.hash_grid import CORNERS, HashGridField, HashGridPass
 from nerf.fields.interface import Rendering
 from nerf.fields.mlp import Weights
 from nerf.fields.occupancy_grid import OccupancyGrid
 from nerf.geometry.rays import Rays
-from nerf.kernels import BOX
 from nerf.runtime.parallel import in_order
 from nerf.runtime.profiler import WorkCounts, span
 from nerf.runtime.randomness import generator
 from nerf.training.colour_loss import huber_loss
+from nerf.training.frustum_mask import compute_frustum_mask
 from nerf.training.learning_rate import lr_multiplier
 from nerf.training.metrics import psnr
 from nerf.training.pixel_sampler import PixelSampler
@@ -55,7 +54,7 @@ class HashGridTrainerSettings:
     where it shows the field which space is empty). ``distortion_weight``: full weight of the distortion loss, for
     scenes without a known background. ``depth_weight``: initial weight of the depth loss, at sparse points and where
     depth maps know the distance. ``min_photos``: how many photos must see a cell of unbounded space before their
-    foregrounds for it to hold density (nerf/fields/frustum_mask.py), or all but one where they are few.
+    foregrounds for it to hold density (nerf/training/frustum_mask.py), or all but one where they are few.
     """
 
     seed: int
@@ -153,7 +152,7 @@ class HashGridTrainer:
     ) -> None:
         self.model, self.settings, self.effects = model, settings, effects
         # Nothing beyond the box of a bounded scene is rendered: a point there would pull density to its walls.
-        self.dataset = dataset if model.space.unbounded else dataset.with_sparse_depths_within(BOX)
+        self.dataset = dataset if model.space.unbounded else dataset.with_sparse_depths_within(model.space.half)
         self.occupancy_grid = OccupancyGrid(model, self._frustum_mask())
         networks = model.weights._asdict()
         self.background = {"background_table": model.background_table} if model.settings.background_model else {}
@@ -260,7 +259,8 @@ class HashGridTrainer:
         if alpha is not None:
             distance = distance * (alpha == 1)
         if not self.model.space.unbounded:
-            distance = distance * ((rays.origins + distance[:, None] * rays.directions).abs() <= BOX).all(-1)
+            inside = (rays.origins + distance[:, None] * rays.directions).abs() <= self.model.space.half
+            distance = distance * inside.all(-1)
         return distance
 
     def _photo_ray_count(self, rays: int, progress: float) -> int:

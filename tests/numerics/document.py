@@ -28,8 +28,8 @@ ELSEWHERE = {
     "nerf/fields/hash_grid.py": "puts rows together: tests/nerf/fields/test_hash_grid.py",
     "nerf/fields/occupancy_grid.py": "σ times the step size; the outermost cells, which reach to infinity, count "
     "half a cell within: tests/nerf/training/test_hash_grid_trainer.py",
-    "nerf/fields/frustum_mask.py": "angles and distances of the middles of cells; the cells around them count as "
-    "well: tests/nerf/fields/test_frustum_mask.py",
+    "nerf/training/frustum_mask.py": "angles and distances of the middles of cells; the cells around them count as "
+    "well: tests/nerf/training/test_frustum_mask.py",
     "nerf/training/ray_dataset.py": "ray directions linear within a patch, of length 1/2 or more before they are "
     "divided by it: tests/nerf/training/test_ray_dataset.py",
     "nerf/rendering/srgb.py": "the standard's own curve, its inverse, from nothing to 1e30: "

@@ -12,8 +12,9 @@ from torch import Tensor
 from nerf.fields.density_grid import DensityGrid
 from nerf.fields.positional_encoding import positional_encoding
 from nerf.geometry.rays import Rays, clip_to_box
+from nerf.geometry.space_maps import Box
 from nerf.geometry.space_maps.contraction import contract, uncontract
-from nerf.kernels import BOX, Backend, RayStepping, Samples, grid_layout, warp
+from nerf.kernels import Backend, RayStepping, Samples, grid_layout, warp
 from nerf.kernels import torch as reference
 from nerf.kernels.torch.occupancy import binary_occupancy, cell_numbers
 from nerf.rendering.sampling import invert_cdf
@@ -129,14 +130,14 @@ def test_contraction_keeps_directions_and_order(point: list[float]) -> None:
 def test_axis_parallel_rays_meet_the_box_where_it_is(towards: list[float], at: float) -> None:
     """From inside, from outside, away from it and past it; both backends march nowhere else. A ray that runs within a
     face may count either way."""
-    assume(abs(at) != float(torch.tensor(BOX)))
+    assume(abs(at) != float(torch.tensor(Box.half)))
     if not any(towards):
         towards = [0.0, 1.0, 0.0]
     directions = torch.nn.functional.normalize(torch.tensor([towards]), dim=-1)
     rays = Rays(torch.tensor([[at, 0.1, -0.2]]), directions, torch.zeros(1), torch.tensor([10.0]))
-    cut = clip_to_box(rays, -BOX, BOX)
+    cut = clip_to_box(rays, -Box.half, Box.half)
     t = torch.linspace(0, 10, 5001)
-    inside = ((rays.origins + t[:, None] * directions).abs() <= BOX).all(-1).double().mean() * 10
+    inside = ((rays.origins + t[:, None] * directions).abs() <= Box.half).all(-1).double().mean() * 10
     assert float(cut.far - cut.near) == pytest.approx(float(inside), abs=5e-3)
     where, stepping = binary_occupancy(torch.full((8,), -1)), RayStepping(0.05, 0.0, False, 8, 1000)
     for backend in (reference, warp):

@@ -5,8 +5,9 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from nerf.geometry.rays import Rays, clip_to_box
-from nerf.geometry.space_maps.contraction import contract
-from nerf.kernels import BOX, CONTRACTED_BOX, BinaryOccupancy, RayStepping, Samples
+from nerf.geometry.space_maps import Box
+from nerf.geometry.space_maps.contraction import Contraction, contract
+from nerf.kernels import BinaryOccupancy, RayStepping, Samples
 from nerf.kernels.torch.occupancy import cell_numbers, is_occupied
 
 
@@ -18,7 +19,7 @@ def march(occupied: BinaryOccupancy, stepping: RayStepping, rays: Rays, jitter: 
     what lies before it.
     """
     if not stepping.contracted:
-        rays = clip_to_box(rays, -BOX, BOX)
+        rays = clip_to_box(rays, -Box.half, Box.half)
     first = t_to_s(stepping, rays.near)
     counts = torch.ceil(t_to_s(stepping, rays.far) - first)
     k = torch.arange(int(counts.max()) if len(counts) else 0, dtype=first.dtype, device=first.device)
@@ -74,16 +75,16 @@ def sample_points_backward(
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
     """Gradients of the rays' origins and directions."""
     if contracted:
-        grad = _contract_backward(_scene_points(rays, samples), grad_points / (2 * CONTRACTED_BOX))
+        grad = _contract_backward(_scene_points(rays, samples), grad_points / (2 * Contraction.half))
     else:
-        grad = grad_points / (2 * BOX)
+        grad = grad_points / (2 * Box.half)
     ray, zero = samples.ray.long(), torch.zeros_like(rays.origins)
     return zero.index_add(0, ray, grad), zero.index_add(0, ray, samples.t[:, None] * grad)
 
 
 def unit_coordinates(points: Float[Tensor, "*points 3"], contracted: bool) -> Float[Tensor, "*points 3"]:
     """Scene points in unit coordinates; those outside the box of a bounded scene leave [0, 1]^3."""
-    half = CONTRACTED_BOX if contracted else BOX
+    half = Contraction.half if contracted else Box.half
     return ((contract(points) if contracted else points) + half) / (2 * half)
 
 

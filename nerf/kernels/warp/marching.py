@@ -9,14 +9,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.geometry.rays import Rays
-from nerf.kernels import BOX, CONTRACTED_BOX, BinaryOccupancy, RayStepping, Samples
+from nerf.geometry.space_maps import Box, Contraction
+from nerf.kernels import BinaryOccupancy, RayStepping, Samples
 from nerf.kernels.warp.launch import launch
 from nerf.kernels.warp.occupancy import cell_number
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-_BOX = wp.constant(BOX)
-_CONTRACTED_BOX = wp.constant(CONTRACTED_BOX)
+_BOX = wp.constant(Box.half)
+_CONTRACTED_BOX = wp.constant(Contraction.half)
 _MAX_INVERSE = wp.constant(1.0e30)
 
 

@@ -5,9 +5,10 @@ from torch import Tensor
 
 from nerf.fields.positional_encoding import positional_encoding
 from nerf.geometry.rays import Rays, clip_to_box, points_on
-from nerf.geometry.space_maps.contraction import contract, uncontract
+from nerf.geometry.space_maps import Box
+from nerf.geometry.space_maps.contraction import Contraction, contract, uncontract
 from nerf.geometry.space_maps.ndc import MIN_DEPTH, Ndc
-from nerf.kernels import BOX, CONTRACTED_BOX, Backend, RayStepping, Samples
+from nerf.kernels import Backend, RayStepping, Samples
 from nerf.kernels.torch.marching import s_to_t, t_to_s
 from pipeline.doctor.numerics import Bound, Case
 
@@ -53,11 +54,11 @@ def _in_ndc(x: Tensor) -> Tensor:
     right, down, depth = ((x - x.new_tensor(NDC.apex)) @ x.new_tensor(NDC.axes).T).unbind(-1)
     depth = torch.where(depth > NEAREST, depth, NEAREST)
     sideways = (each / depth / slope for each, slope in zip((right, down), NDC.slopes, strict=True))
-    return BOX * torch.stack([*sideways, 1 - 2 * NDC.near / depth], -1)
+    return NDC.half * torch.stack([*sideways, 1 - 2 * NDC.near / depth], -1)
 
 
 def _from_ndc(y: Tensor) -> Tensor:
-    x, y, z = (y / BOX).unbind(-1)
+    x, y, z = (y / NDC.half).unbind(-1)
     depth = 2 * NDC.near / (1 - z)
     local = torch.stack([x * NDC.slopes[0] * depth, y * NDC.slopes[1] * depth, depth], -1)
     return local @ local.new_tensor(NDC.axes) + local.new_tensor(NDC.apex)
@@ -103,7 +104,7 @@ def _unit_points(contracted: bool):
 
     def reference(origins: Tensor, towards: Tensor, t: Tensor) -> Tensor:
         points = origins[:, None] + t[..., None] * towards[:, None]
-        half = CONTRACTED_BOX if contracted else BOX
+        half = Contraction.half if contracted else Box.half
         return (((_folded(points) if contracted else points) + half) / (2 * half)).flatten(1)
 
     def backward(backend: Backend, grad: Tensor, origins: Tensor, towards: Tensor, t: Tensor) -> tuple[Tensor, ...]:
@@ -125,7 +126,7 @@ def _slabs(origins: Tensor, towards: Tensor, ends: Tensor, half: float) -> tuple
 
 
 def _clipped(origins: Tensor, towards: Tensor, ends: Tensor) -> Tensor:
-    near, far, hit = _slabs(origins, towards, ends, BOX)
+    near, far, hit = _slabs(origins, towards, ends, Box.half)
     return torch.stack([torch.where(hit, near, ends[:, 1]), torch.where(hit, far, ends[:, 1])], -1)
 
 
@@ -311,7 +312,7 @@ CASES = [
         where="nerf/geometry/rays.py: clip_to_box",
         typical=_box_rays,
         extreme=_hard_box_rays,
-        function=lambda _, o, d, e: torch.stack(clip_to_box(Rays(o, d, *e.unbind(-1)), -BOX, BOX)[2:], -1),
+        function=lambda _, o, d, e: torch.stack(clip_to_box(Rays(o, d, *e.unbind(-1)), -Box.half, Box.half)[2:], -1),
         reference=_clipped,
         value=Bound(2e-6, "row"),
     ),

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 from nerf.effects import ImageEffects
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.mlp import HIDDEN
-from nerf.geometry.space_maps import SpaceMap
-from nerf.kernels import BOX, CONTRACTED_BOX
+from nerf.geometry.space_maps import Box, Contraction, Ndc, SpaceMap
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from stages.contract import Progress
 from stages.effects.decisions import Space
@@ -110,7 +109,7 @@ def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress |
         sizes = (GPU_SIZES[_space(config)], *sizes)
     cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
     pixels = max(max(camera.width, camera.height) for camera in cameras) / config.downscale
-    across = 2 ** math.ceil(math.log2(pixels * (CONTRACTED_BOX / BOX if config.space == "contracted" else 1)))
+    across = 2 ** math.ceil(math.log2(pixels * (Contraction.half / Box.half if config.space == "contracted" else 1)))
     wanted, *smaller = (
         _size(levels, log2_size, max(MIN_MAX_RES, min(most, across)))
         for least, levels, log2_size, most in sizes
@@ -200,7 +199,7 @@ def step_in_words(config: Config) -> str:
     cone = f", from {stepping.linear_until:g} on every {stepping.cone_angle:.1%} of the distance"
     growing = cone if stepping.cone_angle else ""
     if config.space == "ndc":
-        places = f"samples every {stepping.step_size / (2 * BOX):.2%} of 1 / depth from near to infinity"
+        places = f"samples every {stepping.step_size / (2 * Ndc.half):.2%} of 1 / depth from near to infinity"
     else:
         places = f"samples every {stepping.step_size:.2g} scene units{growing}"
     parts = f"{grid.micro_batches} micro-batch{'' if grid.micro_batches == 1 else 'es'}"
@@ -228,7 +227,7 @@ def field_settings(config: Config, background_model: bool, space: SpaceMap | Non
     assert config.space is not None and config.view_dependence is not None, "plan() chooses them"
     across = math.sqrt(3) * grid.max_res
     steps = NDC_STEPS_PER_CELL * grid.max_res if config.space == "ndc" else min(across, MAX_STEPS)
-    shortest = 2 * CONTRACTED_BOX / (_steps_across(grid.max_res) * grid.ray_samples)
+    shortest = 2 * Contraction.half / (_steps_across(grid.max_res) * grid.ray_samples)
     return HashGridSettings(
         num_levels=grid.num_levels,
         log2_hashmap_size=grid.log2_hashmap_size,

@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 from nerf.geometry.rays import Rays
-from nerf.kernels import BOX, BinaryOccupancy, RayStepping, Samples, warp
+from nerf.geometry.space_maps import Box
+from nerf.kernels import BinaryOccupancy, RayStepping, Samples, warp
 from nerf.kernels import torch as reference
 from nerf.kernels.torch.occupancy import binary_occupancy
 
 TOLERANCE = 1e-5
-BOUNDED = RayStepping(2 * BOX * 3**0.5 / 256, 0.0, False, 32, 1024)
+BOUNDED = RayStepping(2 * Box.half * 3**0.5 / 256, 0.0, False, 32, 1024)
 CONTRACTED = RayStepping(0.01, 0.02, True, 32, 1024)
 STEPPINGS = {"bounded": BOUNDED, "contracted": CONTRACTED}
 
@@ -88,7 +89,7 @@ def random_rays(device: str, count: int, far: float = 30.0) -> Rays:
     directions[:part, 0] = 0
     directions[part : 2 * part, 1:] = 0
     directions[2 * part : 3 * part, :2] = -0.0
-    origins[3 * part : 4 * part, 2] = BOX
+    origins[3 * part : 4 * part, 2] = Box.half
     origins[4 * part : 5 * part] = origins[4 * part : 5 * part].clamp(-0.5, 0.5)
     return rays_of(origins, directions, 0.05, far)
 

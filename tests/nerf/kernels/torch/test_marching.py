@@ -4,8 +4,9 @@ import torch
 from torch import Tensor
 
 from nerf.geometry.rays import Rays, clip_to_box
+from nerf.geometry.space_maps import Box
 from nerf.geometry.space_maps.contraction import contract
-from nerf.kernels import BOX, RayStepping
+from nerf.kernels import RayStepping
 from nerf.kernels.torch import march, occupancy_bits, sample_points, sample_points_backward
 from nerf.kernels.torch.marching import s_to_t, t_to_s
 from nerf.kernels.torch.occupancy import binary_occupancy
@@ -64,7 +65,7 @@ def test_intervals_of_a_full_cache_tile_each_ray(stepping: RayStepping) -> None:
     rays = random_rays()
     samples = march(FULL, stepping, rays, torch.zeros(50, dtype=torch.float64))
     lengths = torch.zeros(50, dtype=torch.float64).index_add(0, samples.ray.long(), samples.dt)
-    inside = rays if stepping.contracted else clip_to_box(rays, -BOX, BOX)
+    inside = rays if stepping.contracted else clip_to_box(rays, -Box.half, Box.half)
     torch.testing.assert_close(lengths, inside.far - inside.near)
     assert 0 < (lengths == 0).sum() < 50 or stepping.contracted
 

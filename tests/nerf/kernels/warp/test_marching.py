@@ -5,8 +5,9 @@ import torch
 from torch import Tensor
 
 from nerf.geometry.rays import Rays, clip_to_box
+from nerf.geometry.space_maps import Box
 from nerf.geometry.space_maps.contraction import uncontract
-from nerf.kernels import BOX, BinaryOccupancy, RayStepping, Samples, warp
+from nerf.kernels import BinaryOccupancy, RayStepping, Samples, warp
 from nerf.kernels import torch as reference
 from nerf.kernels.torch.marching import t_to_s, unit_coordinates
 from nerf.kernels.torch.occupancy import binary_occupancy, cell_corners, cell_numbers
@@ -28,7 +29,7 @@ from tests.nerf.kernels.agreement import (
 
 def places(stepping: RayStepping, rays: Rays, jitter: Tensor, samples: Samples) -> Tensor:
     """Ray and number k of each sample on its ray, as one integer."""
-    near = rays.near if stepping.contracted else clip_to_box(rays, -BOX, BOX).near
+    near = rays.near if stepping.contracted else clip_to_box(rays, -Box.half, Box.half).near
     ray = samples.ray.long()
     k = t_to_s(stepping, samples.t) - (t_to_s(stepping, near) + jitter)[ray]
     assert not len(k) or (k - k.round()).abs().max() < 0.3
@@ -113,7 +114,7 @@ def aimed_rays(device: str, stepping: RayStepping, cell: int, count: int) -> Ray
     inside = uniform(device, 9, count, 3)
     inside[: count // 3] = inside[: count // 3].round()
     unit = (corner + inside / stepping.occupancy_resolution).clamp(1e-6, 1 - 1e-6)
-    aim = uncontract(4 * unit - 2) if stepping.contracted else BOX * (2 * unit - 1)
+    aim = uncontract(4 * unit - 2) if stepping.contracted else Box.half * (2 * unit - 1)
     origins = 3 * normal(device, 10, count, 3)
     origins[: count // 2] /= 10
     share = count // 8

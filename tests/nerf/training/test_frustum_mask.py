@@ -7,16 +7,15 @@ from typing import Any
 import pytest
 import torch
 
-from nerf.fields import frustum_mask
-from nerf.fields.frustum_mask import compute_frustum_mask
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.near_far import NEAR_MARGIN
 from nerf.geometry.space_maps import Box, SpaceMap
 from nerf.geometry.space_maps.contraction import Contraction, uncontract
-from nerf.kernels import CONTRACTED_BOX
 from nerf.kernels import torch as reference
 from nerf.kernels.torch.marching import unit_coordinates
 from nerf.kernels.torch.occupancy import cell_corners, cell_numbers, grown, is_occupied
+from nerf.training import frustum_mask
+from nerf.training.frustum_mask import compute_frustum_mask
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from nerf.training.ray_dataset import CENTRE, ROTATION, RayDataset, ray_dataset_from_images
 
@@ -58,7 +57,7 @@ def knowing(views: RayDataset) -> RayDataset:
 def middles(cells: int) -> torch.Tensor:
     """Where the cells' middles are in the scene, in the order of the cache."""
     unit = cell_corners(cells, torch.arange(cells**3)) + 0.5 / cells
-    return uncontract(2 * CONTRACTED_BOX * (unit - 0.5))
+    return uncontract(2 * Contraction.half * (unit - 0.5))
 
 
 def projected(views: RayDataset, points: torch.Tensor, near: float, half: float) -> torch.Tensor:
@@ -140,7 +139,7 @@ def test_nothing_is_ever_sampled_elsewhere_nor_found_there() -> None:
         assert not (is_occupied(field.occupancy_bits, numbers) & ~usable).any()
         trainer.step(step, step / 40)
     elsewhere = cell_corners(16, numbers[~usable]) + 0.5 / 16
-    assert not field.density(uncontract(2 * CONTRACTED_BOX * (elsewhere - 0.5))).any()
+    assert not field.density(uncontract(2 * Contraction.half * (elsewhere - 0.5))).any()
     assert field.unit_density(elsewhere).any(), "which is not what the networks say"
 
 
