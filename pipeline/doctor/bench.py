@@ -67,7 +67,7 @@ def grid_work(space: Space, densities: float) -> WorkCounts:
     """Of a ray in training, its share of the optimiser's included: a large field, in the steps that stage train takes
     on this machine."""
     asked = Config(space=space, view_dependence=True)
-    config = timed(with_defaults(asked), compute_device())
+    config = timed(with_defaults(asked))
     model = HashGridField(field_settings(config, background_model=False), 0, reference)
     density, colour = mlp.density_flops(model.weights), mlp.colour_flops(model.weights)
     colours = SAMPLES_PER_RAY[space]

@@ -94,9 +94,8 @@ def rays_in_budget(config: Config, scene: "Scene", decisions: Decisions) -> floa
 
 def rays_per_second(config: Config, scene: "Scene", decisions: Decisions) -> float:
     """Measured training speed."""
-    device = compute_device()
-    config = field_of(config).timed(config, device)
-    return field_of(config).rays_per_step(config) / seconds_per_step(config, scene, decisions, device)
+    config = field_of(config).timed(config)
+    return field_of(config).rays_per_step(config) / seconds_per_step(config, scene, decisions, compute_device())
 
 
 def seconds_per_step(config: Config, scene: "Scene", decisions: Decisions, device: str) -> float:

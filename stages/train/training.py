@@ -22,7 +22,7 @@ from nerf.training.trainer import FieldTrainer
 from stages.contract import Inputs, Progress, SilentProgress, StageError, StageResult
 from stages.effects.decisions import read_decisions
 from stages.effects.image_effects import image_effects, learnt_effects
-from stages.hardware.device import compute_device, cores
+from stages.hardware.device import compute_device
 from stages.hardware.memory import check_memory
 from stages.hardware.ranks import check_ranks, leading, rank_count, tasks_of_first_rank
 from stages.io.amounts import short_count
@@ -137,7 +137,7 @@ def prepare(
     device = compute_device()
     if device == "cpu":
         field = field_of(config)
-        check_memory(field.memory_bytes(config, cores()), "the field", *field.memory_advice(config))
+        check_memory(field.memory_bytes(config), "the field", *field.memory_advice(config))
     progress.update("reading the photos")
     dataset = _dataset(config, scene, inputs, progress)
     if dataset.depth_maps is not None:

@@ -33,7 +33,7 @@ class Field(Protocol):
         """``config`` with the sizes, where open, of a field that sees so many rays of the scene."""
         ...
 
-    def timed(self, config: Config, device: str) -> Config:
+    def timed(self, config: Config) -> Config:
         """``config`` under which speed is measured before sizes are known."""
         ...
 
@@ -45,8 +45,8 @@ class Field(Protocol):
         """What so many rays take, beside drawing them; "" where each takes the same."""
         ...
 
-    def memory_bytes(self, config: Config, workers: int) -> float:
-        """Memory on the CPU that training takes beside the photos, so many chunks of work at a time."""
+    def memory_bytes(self, config: Config) -> float:
+        """Memory on the CPU that training takes beside the photos."""
         ...
 
     def memory_advice(self, config: Config) -> tuple[str, str]:

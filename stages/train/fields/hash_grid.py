@@ -118,7 +118,7 @@ def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress |
     free = available_on(device)
 
     def bytes_of(size: dict[str, int]) -> float:
-        return memory_bytes(config.filled({"grid": size}), cores())
+        return memory_bytes(config.filled({"grid": size}))
 
     fitting = (size for size in (wanted, *smaller) if bytes_of(size) <= MAX_MEMORY_SHARE * free)
     chosen = next(fitting, [wanted, *smaller][-1])
@@ -145,7 +145,7 @@ def _grids(size: dict[str, int]) -> str:
     return f"{size['num_levels']} grids of up to 2^{size['log2_hashmap_size']} rows"
 
 
-def timed(config: Config, device: str) -> Config:
+def timed(config: Config) -> Config:
     """``config`` under which speed is measured before sizes are known: those which most budgets get."""
     _, *size = SIZES[_space(config)][0]
     return config.filled({"grid": _size(*size)})
@@ -162,8 +162,8 @@ def work(config: Config, rays: float) -> str:
     return f" and evaluate {short_count(rays * SAMPLES_PER_RAY[_space(config)])} colours"
 
 
-def memory_bytes(config: Config, workers: int) -> float:
-    """Memory on the CPU that training takes beside the photos, so many chunks of work at a time."""
+def memory_bytes(config: Config) -> float:
+    """Memory on the CPU that training takes beside the photos."""
     settings = field_settings(config, background_model=False)  # which is small beside the rest
     assert config.grid.target_samples, "plan() chooses it"
     table = TABLE_COPIES * 4 * settings.features_per_level * settings.layout.rows

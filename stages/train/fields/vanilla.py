@@ -7,7 +7,7 @@ from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.space_maps import SpaceMap
 from nerf.training.vanilla_trainer import CHUNK_RAYS, VanillaTrainer, VanillaTrainerSettings
 from stages.contract import Progress
-from stages.hardware.device import cores
+from stages.hardware.device import compute_device, cores
 from stages.train.config import Config
 from stages.train.data import training_background
 from stages.train.fields.space import map_without_scene, space_map_of
@@ -55,9 +55,9 @@ def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress |
     return config
 
 
-def timed(config: Config, device: str) -> Config:
+def timed(config: Config) -> Config:
     """``config`` under which speed is measured: with no more rays in a step than it takes to be as fast."""
-    rays = {"batch_rays": min(rays_per_step(config), MAX_TIMED_RAYS[device] * cores())}
+    rays = {"batch_rays": min(rays_per_step(config), MAX_TIMED_RAYS[compute_device()] * cores())}
     return config.model_copy(update={"vanilla": config.vanilla.model_copy(update=rays)})
 
 
@@ -72,12 +72,12 @@ def work(config: Config, rays: float) -> str:
     return ""
 
 
-def memory_bytes(config: Config, workers: int) -> float:
-    """Memory on the CPU that training takes beside the photos, so many chunks of work at a time."""
+def memory_bytes(config: Config) -> float:
+    """Memory on the CPU that training takes beside the photos: each core computes a chunk of rays."""
     sizes = field_settings(config, map_without_scene(config))
     rays = min(CHUNK_RAYS["cpu"], rays_per_step(config))
     samples = rays * (2 * sizes.samples_coarse + sizes.samples_fine)
-    return workers * ACTIVATIONS_PER_LAYER * 4 * samples * sizes.width * sizes.depth
+    return cores() * ACTIVATIONS_PER_LAYER * 4 * samples * sizes.width * sizes.depth
 
 
 def memory_advice(config: Config) -> tuple[str, str]:

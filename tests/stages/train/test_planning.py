@@ -233,7 +233,7 @@ LARGEST, SMALLEST = (
     {"num_levels": levels, "log2_hashmap_size": log2_size, "max_res": max_res}
     for levels, log2_size, max_res in ((6, 18, 1024), (5, 17, 512))
 )
-NEEDED = memory_bytes(with_grid(CONTRACTED, **LARGEST), 1)
+NEEDED = memory_bytes(with_grid(CONTRACTED, **LARGEST))
 
 
 @pytest.mark.parametrize(
