@@ -99,13 +99,13 @@ class TrainingRun:
         self.schedule_file, self.elapsed_file = folder / "schedule.json", folder / "elapsed.txt"
         self.speed, self.next_revision = TrainingSpeed(), 0.0
         self.live: LiveFolder | None = None  # of a training that may be watched
-        checkpoint = latest_checkpoint(self.checkpoints, progress.note, self._fits)
+        checkpoint = latest_checkpoint(self.checkpoints, progress.note, self._restore)
         if checkpoint is None and budget.after is not None:
             self._extend(budget.after)
         elif checkpoint is None or checkpoint.step == 0:
-            self._start(RunState(**checkpoint.facts) if checkpoint else RunState())
+            self._start(self.state if checkpoint else RunState())
         else:
-            self._resume(checkpoint)
+            self._resume()
         if message := lost_time_message(self.lost):
             progress.note("train.lost-time", message)
 
@@ -146,7 +146,8 @@ class TrainingRun:
         if checkpoint is None:
             raise cannot_continue("train.no-state", f"the last checkpoint of the training in {folder} cannot be read")
         try:
-            self._load(checkpoint, folder / "schedule.json")
+            self._restore(checkpoint)
+            self.schedule = _read_schedule(folder / "schedule.json")
         except (RuntimeError, TypeError) as error:
             raise cannot_continue(
                 "train.other-version", f"another version of this program made the training in {folder}: {error}"
@@ -182,13 +183,18 @@ class TrainingRun:
         assert seconds is not None, "one of the two is given"
         return None, self.state.seconds_before + seconds - min(self.lost, MAX_LOST_FRACTION * seconds)
 
-    def _fits(self, checkpoint: Checkpoint) -> None:
-        """Raise RuntimeError for the state of another field, TypeError for facts that are no run state."""
-        self.make_trainer(RunState(**checkpoint.facts).restarts).load_state(checkpoint.tensors)
+    def _restore(self, checkpoint: Checkpoint) -> None:
+        """State and trainer as of a checkpoint. Raises RuntimeError for the state of another field, TypeError for facts
+        that are no run state."""
+        self.state = RunState(**checkpoint.facts)
+        self.trainer = self.make_trainer(self.state.restarts)
+        self.trainer.load_state(checkpoint.tensors)
+        self.lost = lost_seconds(self.elapsed_file, self.state)
+        self._schedule_evaluation()
 
-    def _resume(self, checkpoint: Checkpoint) -> None:
-        """Resume from a checkpoint with its schedule; a run in seconds makes later revisions again."""
-        self._load(checkpoint, self.schedule_file)
+    def _resume(self) -> None:
+        """Resume from what :meth:`_restore` found, with its schedule; a run in seconds makes later revisions again."""
+        self.schedule = _read_schedule(self.schedule_file)
         _, self.clock_budget = self._budget_limits()
         left = None
         if self.clock_budget is not None:
@@ -198,14 +204,6 @@ class TrainingRun:
         self._schedule_checkpoint()
         self.log.event("resumed", self.state.step)
         self.progress.note("train.resumes", resumed_message(self.state.step, self.schedule.total_steps, left))
-
-    def _load(self, checkpoint: Checkpoint, schedule_file: Path) -> None:
-        self.state = RunState(**checkpoint.facts)
-        self.trainer = self.make_trainer(self.state.restarts)
-        self.trainer.load_state(checkpoint.tensors)
-        self.schedule = StepSchedule(tuple(ScheduleRevision(*revision) for revision in read_json(schedule_file)))
-        self.lost = lost_seconds(self.elapsed_file, self.state)
-        self._schedule_evaluation()
 
     def _take_steps(self) -> None:
         """Steps to the end of the schedule, with everything that is due between them."""
@@ -488,6 +486,10 @@ def resumed_message(step: int, total_steps: int, left: float | None) -> str:
     """After a kill; ``left``: the seconds left of a run in seconds."""
     rest = f" of {total_steps:,}" if left is None else f", with {max(0.0, left):.0f} s of training left"
     return f"resuming from step {step:,}{rest}"
+
+
+def _read_schedule(file: Path) -> StepSchedule:
+    return StepSchedule(tuple(ScheduleRevision(*revision) for revision in read_json(file)))
 
 
 def lost_time_message(seconds: float) -> str | None:
