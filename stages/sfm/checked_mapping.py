@@ -50,34 +50,49 @@ class Runs(NamedTuple):
         return len(self.runs[0])
 
 
+class MappingInput(NamedTuple):
+    """``database`` has all verified matches, ``matches`` those that mapping works on, the best ones where these are
+    thinned. ``options`` are those of incremental mapping. Where there are ``trusted`` pairs (image ids, the lower
+    first), the model hangs by them from photo to photo."""
+
+    database: Path
+    matches: Path
+    options: Any
+    trusted: Collection[tuple[int, int]]
+
+
 class CheckedModel(NamedTuple):
     """The model with only the images that passed the check, by name why others are excluded, whether the sequence of
-    photos was broken in it, and whether it fits the matches as a whole. ``checks``: of all models that were checked and
-    have kept their images since."""
+    photos was broken in it, and whether it fits the matches as a whole. ``candidates``: all that were checked and have
+    kept their images since."""
 
     model: Any
     excluded: dict[str, Note]
     sequence_broken: bool
     fits: bool
-    checks: Sequence[Candidate] = ()
+    candidates: Sequence[Candidate]
 
 
-def run_mapping(
-    strategy: Strategy, database: Path, state: JobState
-) -> tuple[list[Any], CheckedModel, dict[str, Any] | None]:
-    """All sub-models of these matches, best first; the best one as checked, which also takes its place in the list;
-    and how global mapping compares."""
+class Mapped(NamedTuple):
+    """All sub-models, best first; the best one as checked, which is also the first of these; how global mapping
+    compares, None where it was not begun."""
+
+    models: Sequence[Any]
+    checked: CheckedModel
+    global_mapping: dict[str, Any] | None
+
+
+def run_mapping(strategy: Strategy, database: Path, state: JobState) -> Mapped | None:
+    """Map these matches, and check the best model; None if there is none."""
     state.begin("mapping", done=0)
     seed, camera_is_known = state.job.seed, state.job.camera_params is not None
     models, matches = Path(state.job.folder, "models"), database
-    mapping = strategy.mapping or MappingOptions()
-    hold_focal = calibrated = False
+    mapping, hold_focal, calibrated = strategy.mapping or MappingOptions(), False, False
     if state.thinned:
         matches = state.sibling("thinned")
         hold_focal = thin_matches(database, matches, camera_is_known=camera_is_known) and mapping.hold_focal
-        if hold_focal and strategy.mapping is not None:
-            calibrated = calibrate_by_few(matches, mapping, state)
-    comparison = _start_global_mapping(strategy, matches, camera_is_known or calibrated, state)
+        calibrated = hold_focal and strategy.mapping is not None and calibrate_by_few(matches, mapping, state)
+    global_run = _start_global_mapping(strategy, matches, camera_is_known or calibrated, state)
     options = incremental_options(seed, mapping, camera_is_known, state.thinned, hold_focal)
     trusted = consecutive_pairs(state) if strategy.matches == "consecutive" else set[tuple[int, int]]()
     if strategy.mapping is None:
@@ -89,27 +104,23 @@ def run_mapping(
             release_focal_lengths(found[0])
         if found and trusted:
             found = _most_steps(found, matches, mapping, hold_focal, state, trusted)
-    checked = CheckedModel(None, {}, False, False)
-    failure = global_mapping.failure(comparison) if comparison else None
-    other = load_native(comparison.folder) if comparison and not failure else None
-    compared = None if comparison is None else {"failed": failure}
+    failure = global_mapping.failure(global_run) if global_run else None
+    mapped = None
     if found:
-        before = found[0]
         if trusted:
-            copy_consistent_matches(before, state.database, database, trusted)
-        checked = _checked(before, other, database, matches, options, state, trusted)
-        found[0] = checked.model
-        if other is not None:  # where it was taken itself, it is compared with the one that it replaced
-            rejected = before if found[0] is other else other
-            compared = _comparison(found[0], rejected, checked.checks, database, state)
-            compared["taken"] = found[0] is other
+            copy_consistent_matches(found[0], state.database, database, trusted)
+        other = load_native(global_run.folder) if global_run and not failure else None
+        checked = _checked(found[0], other, MappingInput(database, matches, options, trusted), state)
+        if other is None:
+            compared = {"failed": failure} if global_run else None
+        else:
+            compared = _comparison(checked, found[0], other, database, state)
+        mapped = Mapped([checked.model, *found[1:]], checked, compared)
     state.end("mapping")
-    return found, checked, compared
+    return mapped
 
 
-def register_missing(
-    strategy: Strategy, database: Path, state: JobState
-) -> tuple[list[Any], CheckedModel, dict[str, Any] | None]:
+def register_missing(strategy: Strategy, database: Path, state: JobState) -> Mapped:
     """As :func:`run_mapping`, going on from the best model so far, whose missing photos have new matches: as many of
     them as can be are registered in it."""
     state.begin("mapping", done=0)
@@ -122,9 +133,9 @@ def register_missing(
     options = incremental_options(seed, strategy.mapping, known, state.thinned, hold_focal=state.thinned)
     scratch = Path(state.job.folder, "again")
     model = register_again(model, check_model(model, database, seed), matches, state.images, scratch, options)
-    checked = _checked(model, None, database, matches, options, state, ())
+    checked = _checked(model, None, MappingInput(database, matches, options, set()), state)
     state.end("mapping")
-    return [checked.model], checked, best.global_mapping
+    return Mapped([checked.model], checked, best.global_mapping)
 
 
 def calibrate_by_few(matches: Path, mapping: MappingOptions, state: JobState) -> bool:
@@ -207,17 +218,20 @@ def _with_pieces_joined(ranked: Sequence[Runs], state: JobState, trusted: Collec
     return [joined, *(model for model in found if not have.issuperset(model.reg_image_ids()))]
 
 
-def _comparison(model: Any, other: Any, checks: Sequence[Candidate], database: Path, state: JobState) -> dict[str, Any]:
-    """How the models of incremental and global mapping compare, the one that was taken first; and where they differ,
-    how many verified pairs agree with either."""
-    compared = compare_models(model, other) | {"failed": None, "agreeing": None, "agreeing_other": None}
+def _comparison(checked: CheckedModel, incremental: Any, other: Any, database: Path, state: JobState) -> dict[str, Any]:
+    """How the models of ``incremental`` and global mapping (``other``) compare, the one that was taken first; and where
+    they differ, how many verified pairs agree with either."""
+    taken, rejected = checked.model, incremental if checked.model is other else other
+    compared = compare_models(taken, rejected) | {"failed": None, "agreeing": None, "agreeing_other": None}
     if compared["different"]:
-        known = {id(one): checked for one, checked in checks}
-        taken, rejected = (
-            (one, known.get(id(one)) or check_model(one, database, state.job.seed)) for one in (model, other)
-        )
-        compared["agreeing"], compared["agreeing_other"] = agreeing_pairs(taken, rejected, compared["different"])
-    return compared
+        known = {id(one.model): one for one in checked.candidates}
+        pair = (known.get(id(one)) or _candidate(one, database, state) for one in (taken, rejected))
+        compared["agreeing"], compared["agreeing_other"] = agreeing_pairs(*pair, compared["different"])
+    return compared | {"taken": taken is other}
+
+
+def _candidate(model: Any, database: Path, state: JobState) -> Candidate:
+    return Candidate(model, check_model(model, database, state.job.seed))
 
 
 def _start_global_mapping(
@@ -231,53 +245,45 @@ def _start_global_mapping(
     return global_mapping.start(matches, thinned, state.images, folder, state.job.seed, cameras_are_known)
 
 
-def _checked(
-    model: Any,
-    other: Any,
-    database: Path,
-    matches: Path,
-    options: Any,
-    state: JobState,
-    trusted: Collection[tuple[int, int]],
-) -> CheckedModel:
+def _checked(model: Any, other: Any, given: MappingInput, state: JobState) -> CheckedModel:
     """The model without the images that fail the check. These are registered again first, in the model of global
-    mapping where that fits the verified matches better. Of a model that hangs by ``trusted`` pairs from photo to photo
-    each of these has to agree."""
-    best, sequence = (model, check_model(model, database, state.job.seed)), capture_sequence(database, state)
-    checks = [best]
-    if not fragments_sequence(best[1], sequence):
-        if other is not None and (_has_nearly_all(other, model, state) or best[1].failed() or disagree(model, other)):
-            checks.append((other, check_model(other, database, state.job.seed)))
-            best = better(*checks)
-            if best[0] is other:
+    mapping where that fits the verified matches better. Of a model that hangs by trusted pairs from photo to photo each
+    of these has to agree."""
+    best, sequence = _candidate(model, given.database, state), capture_sequence(given.database, state)
+    candidates = [best]
+    if not fragments_sequence(best.checked, sequence):
+        failed = best.checked.failed()
+        if other is not None and (_has_nearly_all(other, model, state) or failed or disagree(model, other)):
+            candidates.append(_candidate(other, given.database, state))
+            best = better(*candidates)
+            if best.model is other:
                 state.send(
                     note=Note(
                         "sfm.global-mapping",
                         "global mapping is used: it agrees better with the verified matches than incremental mapping",
                     )
                 )
-        if failed := best[1].failed():
-            misplaced = best[1].check.misplaced.any()
+        if failed := best.checked.failed():
+            misplaced = best.checked.check.misplaced.any()
             what = "contradict their verified matches" if misplaced else "are not linked to the others"
             state.send(
                 note=Note(
                     "sfm.registered-again",
-                    f"{len(failed)} of {len(best[1].ids)} registered photos {what}: registering them again",
+                    f"{len(failed)} of {len(best.checked.ids)} registered photos {what}: registering them again",
                 )
             )
-            again = register_again(*best, matches, state.images, Path(state.job.folder, "again"), options)
-            checks.append((again, check_model(again, database, state.job.seed)))
-            best = max(best, checks[-1], key=_passing)
-    model, checked = best
-    why = reasons(model, checked)
-    deregister(model, checked.failed())
-    supported = supported_steps(model, state.database, trusted) if trusted else None
-    outside = drop_outside_main_segment(model, checked, sequence, supported)
+            scratch = Path(state.job.folder, "again")
+            again = register_again(*best, given.matches, state.images, scratch, given.options)
+            candidates.append(_candidate(again, given.database, state))
+            best = max(best, candidates[-1], key=lambda one: int(one.checked.check.passed.sum()))
+    why = reasons(*best)
+    deregister(best.model, best.checked.failed())
+    supported = supported_steps(best.model, state.database, given.trusted) if given.trusted else None
+    outside = drop_outside_main_segment(*best, sequence, supported)
     excluded = why | outside
+    kept = [one for one in candidates if not (excluded and one is best)]
     broken = len(outside) > MAX_STRAY_FRACTION * len(state.photos)
-    return CheckedModel(
-        model, excluded, broken, checked.fits, [one for one in checks if not (excluded and one is best)]
-    )
+    return CheckedModel(best.model, excluded, broken, best.checked.fits, kept)
 
 
 def _has_nearly_all(other: Any, model: Any, state: JobState) -> bool:
@@ -285,7 +291,3 @@ def _has_nearly_all(other: Any, model: Any, state: JobState) -> bool:
     is looked for again."""
     missing = len(state.photos) - other.num_reg_images()
     return other.num_reg_images() > model.num_reg_images() and missing < MIN_MISSING_TO_START_OVER * len(state.photos)
-
-
-def _passing(candidate: Candidate) -> int:
-    return int(candidate[1].check.passed.sum())

@@ -197,22 +197,22 @@ def _try(strategy: Strategy, missing: list[int], state: JobState) -> None:
     state.strategy, state.seconds = strategy.name, {}
     database, match_graph = match_photos(strategy, missing, state)
     adding, before = strategy.matches == "missing", state.usable()
-    models, checked, compared = (register_missing if adding else run_mapping)(strategy, database, state)
+    mapped = (register_missing if adding else run_mapping)(strategy, database, state)
     outcome = Outcome(strategy.name, database.name, seconds=state.seconds, match_graph=match_graph)
-    if models:
-        folder = state.log.model(strategy.name)
-        write_native(folder, models[0])
+    if mapped:
+        folder, best = state.log.model(strategy.name), mapped.models[0]
+        write_native(folder, best)
         make_durable(folder)
         outcome = replace(
             outcome,
-            groups=[_files(model) for model in models],
-            points=models[0].num_points3D(),
-            reprojection_px=models[0].compute_mean_reprojection_error(),
-            conflict=find_conflict(models),
-            excluded=checked.excluded,
-            sequence_broken=checked.sequence_broken,
-            fits=checked.fits,
-            global_mapping=compared,
+            groups=[_files(model) for model in mapped.models],
+            points=best.num_points3D(),
+            reprojection_px=best.compute_mean_reprojection_error(),
+            conflict=find_conflict(mapped.models),
+            excluded=mapped.checked.excluded,
+            sequence_broken=mapped.checked.sequence_broken,
+            fits=mapped.checked.fits,
+            global_mapping=mapped.global_mapping,
         )
         if adding and before:  # its other sub-models are as they were
             still_excluded = {name: why for name, why in before.excluded.items() if name not in outcome.groups[0]}
@@ -221,7 +221,7 @@ def _try(strategy: Strategy, missing: list[int], state: JobState) -> None:
                 groups=[outcome.groups[0], *before.groups[1:]],
                 match_graph=before.match_graph,
                 conflict=before.conflict,
-                excluded=still_excluded | checked.excluded,
+                excluded=still_excluded | mapped.checked.excluded,
             )
     state.log.add(outcome)
 

@@ -52,8 +52,12 @@ class Checked(NamedTuple):
 
 CLEARLY_FEWER = 0.9  # of the pairs that agree with another model
 
-Candidate = tuple[pycolmap.Reconstruction, Checked]
-"""A model and its check."""
+
+class Candidate(NamedTuple):
+    """A model and its check."""
+
+    model: pycolmap.Reconstruction
+    checked: Checked
 
 
 def check_model(model: pycolmap.Reconstruction, database: Path, seed: int) -> Checked:
@@ -76,9 +80,9 @@ def agreeing_pairs(first: Candidate, second: Candidate, files: Container[str]) -
     """How many verified pairs with one of these images agree with the poses of either model."""
 
     def count(candidate: Candidate) -> int:
-        (model, (ids, matches, _)), check = candidate, _under_smallest_tolerance(candidate, (first, second))
-        among = np.array([model.image(image_id).name in files for image_id in ids], bool)
-        return int((check.agrees & among[matches.pairs].any(axis=1)).sum())
+        (model, checked), check = candidate, _under_smallest_tolerance(candidate, (first, second))
+        among = np.array([model.image(image_id).name in files for image_id in checked.ids], bool)
+        return int((check.agrees & among[checked.matches.pairs].any(axis=1)).sum())
 
     return count(first), count(second)
 
@@ -86,9 +90,8 @@ def agreeing_pairs(first: Candidate, second: Candidate, files: Container[str]) -
 def _under_smallest_tolerance(candidate: Candidate, candidates: Sequence[Candidate]) -> PoseCheck:
     """The check with one tolerance for all: a model that is wrong as a whole has large errors everywhere, and so a
     large tolerance of its own."""
-    model, checked = candidate
-    tolerance = min(one.check.tolerance_px for _, one in candidates)
-    return check_poses(checked.matches, camera_poses(model), tolerance)
+    tolerance = min(one.checked.check.tolerance_px for one in candidates)
+    return check_poses(candidate.checked.matches, camera_poses(candidate.model), tolerance)
 
 
 def camera_poses(model: pycolmap.Reconstruction) -> Float[np.ndarray, "photos 3 4"]:

@@ -21,6 +21,7 @@ from stages.sfm.colmap.diagnosis import compare_models
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.mappers import incremental_options, map_incrementally
 from stages.sfm.colmap.repair import (
+    Candidate,
     agreeing_pairs,
     better,
     check_model,
@@ -86,7 +87,7 @@ def test_a_model_that_is_wrong_as_a_whole_loses(made: Made) -> None:
     wrong = pycolmap.Reconstruction(made.model)
     for image_id in range(1, PHOTOS + 1):
         turn(wrong, image_id, 0.15 * (-1) ** image_id)
-    candidates = [(model, check_model(model, made.database, 0)) for model in (wrong, made.model)]
+    candidates = [Candidate(model, check_model(model, made.database, 0)) for model in (wrong, made.model)]
     assert candidates[0][1].check.tolerance_px > 1.5 * candidates[1][1].check.tolerance_px
     assert candidates[0][1].check.passed.sum() > PHOTOS / 2
     assert better(*candidates) is better(*candidates[::-1]) is candidates[1]
@@ -98,7 +99,7 @@ def test_a_model_that_is_wrong_as_a_whole_loses(made: Made) -> None:
 
 def test_of_models_that_agree_as_well_the_first_is_taken(made: Made) -> None:
     same = pycolmap.Reconstruction(made.model)
-    candidates = [(model, check_model(model, made.database, 0)) for model in (made.model, same)]
+    candidates = [Candidate(model, check_model(model, made.database, 0)) for model in (made.model, same)]
     assert better(*candidates) is candidates[0] and better(*candidates[::-1]) is candidates[1]
 
 
