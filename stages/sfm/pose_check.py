@@ -84,42 +84,64 @@ def transfer_errors_px(
     and how far behind the camera the point would be.
     """
     source, target = (np.concatenate([matches.keypoint[:, a], matches.keypoint[:, 1 - a]]) for a in (0, 1))
-    rotation, centre = world_from_camera[:, :, :3], world_from_camera[:, :, 3]
-    ray = np.einsum("kij,kj->ki", rotation[matches.photo], matches.ray_direction)
-    here, there = ray[source], ray[target]
-    baseline = centre[matches.photo[target]] - centre[matches.photo[source]]
-    ahead = np.einsum("ki,ki->k", baseline, here)
-    sideways = ahead[:, None] * here - baseline  # the point moves that way, seen from the target, as it comes nearer
-    base = np.linalg.norm(sideways, axis=1)
-    sideways = np.divide(sideways, base[:, None], out=np.zeros_like(sideways), where=base[:, None] > 0)
-    seen_ahead, seen_sideways = np.einsum("ki,ki->k", there, here), np.einsum("ki,ki->k", there, sideways)
-    across = np.einsum("ki,ki->k", there, np.cross(here, sideways))
-    across = np.where(base > 0, across, np.linalg.norm(np.cross(here, there), axis=1))
-    scale = base * seen_ahead + seen_sideways * ahead  # not positive where the rays do not meet before the cameras
+    seen = _in_epipolar_planes(matches, world_from_camera, source, target)
+    scale = seen.base * seen.ahead + seen.sideways * seen.step  # not positive where rays do not meet before the cameras
     meets = scale > 0
-    inverse_depth = np.maximum(np.divide(seen_sideways, scale, out=np.zeros_like(base), where=meets), 0)
-    evidence = np.where(meets, _sensitivity(inverse_depth, base, ahead)[1], 0.0) ** 2
+    inverse_depth = np.maximum(np.divide(seen.sideways, scale, out=np.zeros_like(scale), where=meets), 0)
     sure = matches.weight >= MIN_PAIR_MATCHES if trusted is None else trusted
-    evidence *= np.tile(sure[matches.pair], 2)
+    evidence = np.where(meets, _sensitivity(seen, inverse_depth)[1], 0.0) ** 2 * np.tile(sure[matches.pair], 2)
     others, weight = _median_of_others(inverse_depth, evidence, source)
     known = weight > 0
-    others = np.where(known, others, inverse_depth)
-    along = np.arctan2(seen_sideways, seen_ahead) - np.arctan2(others * base, 1 - others * ahead)
-    nearness, slope = _sensitivity(others, base, ahead)
+    predicted = np.where(known, others, inverse_depth)
+    along = np.arctan2(seen.sideways, seen.ahead) - np.arctan2(predicted * seen.base, 1 - predicted * seen.step)
+    nearness, slope = _sensitivity(seen, predicted)
     noise = (1 + nearness**2) / 2  # of the ray that is transferred and of the one it is compared with; 1 at equal depth
-    depth_noise = np.divide(MEDIAN_VARIANCE * slope**2, weight, out=np.zeros_like(base), where=known)
-    angle = np.hypot(np.arcsin(np.clip(across, -1, 1)) / np.sqrt(noise), along / np.sqrt(noise + depth_noise))
+    depth_noise = np.divide(MEDIAN_VARIANCE * slope**2, weight, out=np.zeros_like(slope), where=known)
+    angle = np.hypot(np.arcsin(np.clip(seen.across, -1, 1)) / np.sqrt(noise), along / np.sqrt(noise + depth_noise))
     return matches.focal_px[matches.photo[target]] * angle, known
 
 
+class _SeenRays(NamedTuple):
+    """The targets' rays of directed matches, in the axes of their epipolar planes: *ahead* is the source's ray,
+    *sideways* at a right angle to it in the plane, where the point moves, seen from the target, as it comes nearer, and
+    *across* the plane's normal. From source to target it is ``step`` ahead and ``base`` against sideways. Where there
+    is no base, ``sideways`` is 0 and ``across`` all that is not ahead."""
+
+    step: Float[np.ndarray, "n"]
+    base: Float[np.ndarray, "n"]
+    ahead: Float[np.ndarray, "n"]
+    sideways: Float[np.ndarray, "n"]
+    across: Float[np.ndarray, "n"]
+
+
+def _in_epipolar_planes(
+    matches: PairMatches,
+    world_from_camera: Float[np.ndarray, "photos 3 4"],
+    source: Int[np.ndarray, "n"],
+    target: Int[np.ndarray, "n"],
+) -> _SeenRays:
+    rotation, centre = world_from_camera[:, :, :3], world_from_camera[:, :, 3]
+    ray = np.einsum("kij,kj->ki", rotation[matches.photo], matches.ray_direction)
+    ahead, there = ray[source], ray[target]
+    baseline = centre[matches.photo[target]] - centre[matches.photo[source]]
+    step = np.einsum("ki,ki->k", baseline, ahead)
+    sideways = step[:, None] * ahead - baseline
+    base = np.linalg.norm(sideways, axis=1)
+    sideways = np.divide(sideways, base[:, None], out=np.zeros_like(sideways), where=base[:, None] > 0)
+    seen_ahead, seen_sideways = np.einsum("ki,ki->k", there, ahead), np.einsum("ki,ki->k", there, sideways)
+    across = np.einsum("ki,ki->k", there, np.cross(ahead, sideways))
+    across = np.where(base > 0, across, np.linalg.norm(np.cross(ahead, there), axis=1))
+    return _SeenRays(step, base, seen_ahead, seen_sideways, across)
+
+
 def _sensitivity(
-    inverse_depth: Float[np.ndarray, "n"], base: Float[np.ndarray, "n"], ahead: Float[np.ndarray, "n"]
+    seen: _SeenRays, inverse_depth: Float[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """How many times nearer a point is to the target than to the source, and by how much its direction there changes
     with its inverse depth."""
-    squared = (1 - inverse_depth * ahead) ** 2 + (inverse_depth * base) ** 2
+    squared = (1 - inverse_depth * seen.step) ** 2 + (inverse_depth * seen.base) ** 2
     squared = np.maximum(squared, MIN_RELATIVE_DEPTH**2)
-    return 1 / np.sqrt(squared), base / squared
+    return 1 / np.sqrt(squared), seen.base / squared
 
 
 def _median_of_others(
@@ -187,16 +209,16 @@ def check_poses(
     within, and hardly across. A group is misplaced if more matches across contradict than agree.
     """
     count, nowhere = len(world_from_camera), np.zeros(len(matches.pairs), bool)
-    error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, nowhere))
+    error = _pair_errors_px(matches, world_from_camera, nowhere)
     _, tolerance = _tolerance_px(error, matches.weight, max_tolerance_px)
     misplaced = _misplaced(*_votes(matches, error, tolerance, count))
-    error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, _trusted(matches, misplaced)))
+    error = _pair_errors_px(matches, world_from_camera, _trusted(matches, misplaced))
     median, tolerance = _tolerance_px(error, matches.weight, max_tolerance_px)
     support, against = _votes(matches, error, tolerance, count)
     misplaced = _misplaced(support, against)
     # Depths that a misplaced group got wrong count against good photos beside it: these are checked again without.
     for _ in range(MAX_RECHECKS if misplaced.any() else 0):
-        error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, _trusted(matches, misplaced)))
+        error = _pair_errors_px(matches, world_from_camera, _trusted(matches, misplaced))
         support, against = _votes(matches, error, tolerance, count)
         cleared = misplaced & ((support - against)[:, ~misplaced].sum(axis=1) > 0)
         if not cleared.any():
@@ -235,14 +257,14 @@ def fits_as_a_whole(matches: PairMatches, check: PoseCheck) -> bool:
 
 def median_error_px(matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"]) -> float:
     """How far half of the matches lie from where the poses predict them."""
-    return _tolerance_px(pair_medians(matches, *transfer_errors_px(matches, world_from_camera)), matches.weight)[0]
+    return _tolerance_px(_pair_errors_px(matches, world_from_camera), matches.weight)[0]
 
 
 def agreement(
     matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"], among: Bool[np.ndarray, "pairs"]
 ) -> tuple[int, int]:
     """How many pairs, of those ``among`` them, agree with poses, and how many agree with or contradict them."""
-    error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera))
+    error = _pair_errors_px(matches, world_from_camera)
     _, tolerance = _tolerance_px(error, matches.weight)
     agreeing = int((error <= tolerance)[among].sum())
     return agreeing, agreeing + int(_contradicts(matches, error, tolerance)[among].sum())
@@ -288,7 +310,7 @@ def supported_pairs(
 
     Stricter than :func:`check_poses`, which believes a pair that neither agrees nor contradicts: where a sequence hangs
     by one pair from photo to photo, that pair has to agree."""
-    error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, trusted))
+    error = _pair_errors_px(matches, world_from_camera, trusted)
     _, tolerance = _tolerance_px(error[trusted], matches.weight[trusted])
     return trusted & (error <= tolerance)
 
@@ -439,6 +461,15 @@ def pair_medians(
     middle = np.minimum((bounds[:-1] + bounds[1:]) // 2, max(0, len(order) - 1))
     found = error_px[order][middle] if len(order) else np.full(len(middle), np.nan)
     return np.where(np.diff(bounds) >= MIN_MATCHES_FOR_MEDIAN, found, np.nan)
+
+
+def _pair_errors_px(
+    matches: PairMatches,
+    world_from_camera: Float[np.ndarray, "photos 3 4"],
+    trusted: Bool[np.ndarray, "pairs"] | None = None,
+) -> Float[np.ndarray, "pairs"]:
+    """:func:`pair_medians` of :func:`transfer_errors_px`."""
+    return pair_medians(matches, *transfer_errors_px(matches, world_from_camera, trusted))
 
 
 def _votes(
