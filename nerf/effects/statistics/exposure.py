@@ -27,7 +27,7 @@ EV = float(np.log(2.0))
 # A gain that is off by d in ln(light) makes an error of VALUE_PER_LOG_LIGHT d in sRGB values: MIN_EFFECT is d = 0.034,
 # 0.05 EV. Called for from twice that, when gains deviate by 0.1 EV.
 THRESHOLD_EV = 2 * MIN_EFFECT / VALUE_PER_LOG_LIGHT / EV
-REDESCENDING = 5.0  # in robust deviations: as HUBER loses some 5 % to plain means of normal noise
+GEMAN_MCCLURE = 5.0  # in robust deviations: as HUBER loses some 5 % to plain means of normal noise
 HUBER_ROUNDS, MAX_ROUNDS = 8, 30
 CONVERGED = 1e-5  # of a log gain: a tenth of what gains are rounded to where they leave
 MIN_NOISE = 0.25 / 255  # of an sRGB value: no photo of 8 bits is more exact, and a perfect fit has no deviation
@@ -78,15 +78,15 @@ def fit_exposure(tracks: TrackColours) -> ExposureFit:
     vignetting, noise = np.zeros(3), np.zeros(3)
     for channel in range(3 if layout.connected.any() else 0):
         part = y[:, channel]
-        weight[:, channel], noise[channel], given_up = _robust_weights(layout, part, sigma[:, channel])
+        weight[:, channel], noise[channel], inflation = _robust_weights(layout, part, sigma[:, channel])
         slope, slope_error = layout.slope(part, square, weight[:, channel])
         if abs(slope) > MIN_SIGNAL_TO_NOISE * slope_error:
             vignetting[channel] = slope
             part = part - slope * square
-            weight[:, channel], noise[channel], given_up = _robust_weights(layout, part, sigma[:, channel])
+            weight[:, channel], noise[channel], inflation = _robust_weights(layout, part, sigma[:, channel])
         gain[:, channel] = layout.view_effects(part, weight[:, channel])
         rest[:, channel] = layout.within_points(part - gain[layout.view, channel], weight[:, channel])
-        error[:, channel] = layout.standard_errors(rest[:, channel], weight[:, channel]) * given_up
+        error[:, channel] = layout.standard_errors(rest[:, channel], weight[:, channel]) * inflation
     known = np.asarray(np.isfinite(error).all(axis=1))
     if known.any():
         gain = np.where(known[:, None], gain - np.median(gain[known], axis=0), 0.0)
@@ -102,8 +102,9 @@ def _robust_weights(
     """Converged weights, the robust deviation in units of ``sigma``, and by how much standard errors grow over those of
     fixed weights.
 
-    What is left of an observation is smaller by sqrt(1 - its part in the point's weight) than its noise. Weights that
-    fall with what is left follow a shift by less than it: E[w + u w'] in place of E[w] (Huber 1964).
+    What is left of an observation is smaller by sqrt(1 - its part in the point's weight) than its noise. Weights w(u)
+    that fall with what is left, u, follow a shift by less than it: E[w + u w'] in place of E[w] (Huber 1964). Geman and
+    McClure's are w = 1/q² with q = 1 + (u/c)², so that w + u w' = (4 - 3q)/q³.
     """
     base = sigma**-2
     weight, scale, size, before = base, 0.0, np.zeros_like(y), np.zeros(layout.views)
@@ -116,12 +117,12 @@ def _robust_weights(
         if turn < HUBER_ROUNDS:
             weight = base * np.minimum(1, HUBER / np.maximum(size, HUBER))
         else:
-            weight = base / (1 + (size / REDESCENDING) ** 2) ** 2
+            weight = base / (1 + (size / GEMAN_MCCLURE) ** 2) ** 2
         if turn > HUBER_ROUNDS and np.abs(gain - before).max() < CONVERGED:
             break
         before = gain
-    bent = 1 + (size / REDESCENDING) ** 2
-    followed = float(np.sum(base * (4 - 3 * bent) / bent**3)) / float(np.sum(base / bent**2))
+    q = 1 + (size / GEMAN_MCCLURE) ** 2
+    followed = float(np.sum(base * (4 - 3 * q) / q**3)) / float(np.sum(base / q**2))
     return weight, scale, 1 / max(followed, 0.1)
 
 
