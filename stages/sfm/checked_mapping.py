@@ -225,8 +225,8 @@ def _comparison(checked: CheckedModel, incremental: Any, other: Any, database: P
     compared = compare_models(taken, rejected) | {"failed": None, "agreeing": None, "agreeing_other": None}
     if compared["different"]:
         known = {id(one.model): one for one in checked.candidates}
-        pair = (known.get(id(one)) or _candidate(one, database, state) for one in (taken, rejected))
-        compared["agreeing"], compared["agreeing_other"] = agreeing_pairs(*pair, compared["different"])
+        first, second = (known.get(id(one)) or _candidate(one, database, state) for one in (taken, rejected))
+        compared["agreeing"], compared["agreeing_other"] = agreeing_pairs(first, second, compared["different"])
     return compared | {"taken": taken is other}
 
 
