@@ -10,11 +10,13 @@ replays them gives every step the learning rate it had before, and continues fro
 import math
 from typing import Literal, NamedTuple
 
+from nerf.training.learning_rate import LR_HOLD_FRACTION
+
 Reason = Literal["begin", "clock", "target", "finish", "more"]
 
 # A run that stops early, at a target or as the user wants it, gets the last quarter of a run, in which the hash grid's
 # learning rate decays; the vanilla NeRF's falls all the time.
-DECAY_START_PROGRESS = 0.75
+DECAY_START_PROGRESS = LR_HOLD_FRACTION
 
 
 class ScheduleRevision(NamedTuple):

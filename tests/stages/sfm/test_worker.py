@@ -12,7 +12,7 @@ from stages.sfm.retry_strategies import STRATEGIES, Outcome, StrategyLog
 
 
 @pytest.mark.parametrize("missing", [1, 20])
-def test_matches_are_read_only_where_so_many_are_missing_that_they_decide(
+def test_matches_are_read_only_where_they_decide(
     missing: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (strategy,) = (one for one in STRATEGIES if one.name == "weaker initial pair")

@@ -73,7 +73,7 @@ def test_two_parts_of_the_graph_are_tried_with_each_other() -> None:
     assert ((more < 10).sum(axis=1) == 1).all()
 
 
-def test_every_photo_on_the_smaller_side_is_tried_with_its_most_similar_ones_across() -> None:
+def test_smaller_sides_are_tried_with_what_is_most_similar_across() -> None:
     """Fronds of one to six photos hang by one edge each on a ring: every one of them is a weak cut."""
     truth = walk(40, reach=2)
     fronds = [range(40, 41), range(41, 44), range(44, 50)]
