@@ -11,7 +11,7 @@ from pydantic import Field
 from stages.contract import Auto, Inputs, Progress, StageConfig, StageResult, Workload
 
 INPUTS = ("ingest", "normalise")
-VERSION = 2
+VERSION = 3
 EXIT_CODE = 20
 RESUMES = True
 ON_REQUEST = True
