@@ -255,7 +255,8 @@ def _extract_here(
         )
 
 
-Item, Result = TypeVar("Item"), TypeVar("Result")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 def match_pairs(
