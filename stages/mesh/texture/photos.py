@@ -115,7 +115,8 @@ def read_picture(photo: Photo, downscale: float) -> Picture:
     used = np.ones((height, width), np.uint8) if mask is None else mask.astype(np.uint8)
     if photo.has_alpha and pixels.shape[2] == 4:
         opaque = (pixels[..., 3] >= OPAQUE_FROM).astype(np.uint8)
-        used &= cv2.erode(opaque, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
+        inside = cv2.erode(opaque, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
+        used = np.minimum(used, np.asarray(inside, np.uint8))
     return Picture(np.ascontiguousarray(pixels[..., :3]), used)
 
 

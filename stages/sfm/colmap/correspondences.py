@@ -57,9 +57,9 @@ def read_pair_matches(
         if most and len(inliers) > most:
             inliers = inliers[random.choice(len(inliers), most, replace=False)]
         keypoints.append(inliers)
-        known = geometry.F is not None and len(inliers) >= MIN_PAIR_MATCHES
-        ends = xy[first][inliers[:, 0]], xy[second][inliers[:, 1]]
-        noise.append(_epipolar_px(geometry.F, *ends) if known else np.nan)
+        noise.append(np.nan)
+        if geometry.F is not None and len(inliers) >= MIN_PAIR_MATCHES:
+            noise[-1] = _epipolar_px(geometry.F, xy[first][inliers[:, 0]], xy[second][inliers[:, 1]])
     directions = [_directions(xy[image_id], model.camera(model.image(image_id).camera_id)) for image_id in ids]
     begins = np.concatenate([[0], np.cumsum([len(some) for some in directions])]).astype(int)
     rows = [some + begins[list(pair)] for some, pair in zip(keypoints, pairs, strict=True)]

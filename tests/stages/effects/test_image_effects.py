@@ -10,10 +10,8 @@ POSE = np.concatenate([np.eye(3), [[1.0], [2.0], [3.0]]], axis=1)
 
 
 def scene() -> Scene:
-    views = tuple(
-        View(name, f"images/{name}", 0, POSE, 0.1, 9.0, split)
-        for name, split in (("a.png", "train"), ("b.png", "train"), ("c.png", "test"))
-    )
+    one, other = (View(name, f"images/{name}", 0, POSE, 0.1, 9.0, "train") for name in ("a.png", "b.png"))
+    views = one, other, View("c.png", "images/c.png", 0, POSE, 0.1, 9.0, "test")
     camera = Camera("PINHOLE", 8, 8, (8.0, 8.0, 4.0, 4.0))
     return Scene((camera,), views, Similarity(1.0, np.eye(3), np.zeros(3)), True, False, "forward-facing", True)
 

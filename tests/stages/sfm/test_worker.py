@@ -12,9 +12,7 @@ from stages.sfm.retry_strategies import STRATEGIES, Outcome, StrategyLog
 
 
 @pytest.mark.parametrize("missing", [1, 20])
-def test_matches_are_read_only_where_they_decide(
-    missing: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_matches_are_read_only_where_they_decide(missing: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (strategy,) = (one for one in STRATEGIES if one.name == "weaker initial pair")
     read = []
     monkeypatch.setattr(worker, "links", lambda *_: read.append(1) or Links(join=False, planar=False))

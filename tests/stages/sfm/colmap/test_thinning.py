@@ -58,9 +58,7 @@ def test_a_track_that_sees_a_photo_twice_comes_last() -> None:
     assert kept(matched(twice, MIDDLE, [(3, 1), (2, 1)]), ONE_CELL, 1) == {*MIDDLE, (3, 1), (2, 1)}
 
 
-def test_told_focal_lengths_do_not_depend_on_timing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_told_focal_lengths_do_not_depend_on_timing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told = []
     for name, rounding in (("one", 0.0), ("other", 3e-13)):
         database = tmp_path / f"{name}.db"
