@@ -24,7 +24,7 @@ from nerf import REGION_HALF_SIZE
 from pipeline.demo.truth import Truth, compare_with_truth
 from pipeline.engine.workspace import Workspace
 from stages.contract import Inputs, SilentProgress
-from stages.mesh import COLOURED_FACES, INPUTS, Config
+from stages.mesh import INPUTS, Config
 from stages.mesh.extraction import Source, extract_mesh, load, write_mesh
 from stages.mesh.files import ColouredMesh
 from stages.mesh.surface import sample_surface
@@ -54,9 +54,7 @@ def figures(folders: Inputs, resolution: int, truth: Truth | None) -> dict[str, 
     """One resolution's row of the table."""
     source = load(folders, SilentProgress())
     started = time.perf_counter()
-    made = extract_mesh(
-        Config(resolution=resolution, max_faces=COLOURED_FACES, texture_size=0), source, SilentProgress()
-    )
+    made = extract_mesh(Config(resolution=resolution, texture_size=0), source, SilentProgress())
     seconds = time.perf_counter() - started
     if truth is None:
         known = to_points(made.mesh, source.points)

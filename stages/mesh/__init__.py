@@ -31,8 +31,6 @@ MIN_SHARE_OF_SHAPE = 0.3  # of a time limit, that a texture leaves
 
 Format = Literal["glb", "ply", "obj", "stl", "3mf"]
 Keep = Literal["visible", "largest", "all"]
-# Faces by default. With a texture, fewer show the same (docs/experiments/mesh.md); without one, each shows a colour.
-TEXTURED_FACES, COLOURED_FACES = 100_000, 300_000
 
 
 class Config(StageConfig):
@@ -67,7 +65,10 @@ class Config(StageConfig):
     max_faces: Auto[int] = Field(
         default=None,
         ge=100,
-        description="Maximum number of faces after decimation (default: 100000, without a texture 300000).",
+        description=(
+            "Maximum number of faces after decimation (default: a quarter of them, at least 100000 and at most 300000; "
+            "without a texture 300000)."
+        ),
     )
     close: float = Field(
         default=0.0,
@@ -114,7 +115,7 @@ def _texture_seconds(config: Config, photos: int, cores: int) -> float:
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Choose the resolution: from the training, or from what a texture leaves of ``seconds`` and the speed of this
-    machine; the number of faces; and the frame."""
+    machine; and the frame."""
     from stages.mesh.resolution import choose_resolution
 
     metres = metres_per_unit(inputs["scale"])
@@ -126,14 +127,14 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
             "Give --scale.marker or --scale.distance, or leave --mesh.frame out.",
         )
     frame = config.frame or ("sfm" if metres is None else "metric")
-    faces, resolution = TEXTURED_FACES if config.texture_size else COLOURED_FACES, config.resolution
+    resolution = config.resolution
     if resolution is None:
         seconds = config.seconds
         if seconds is not None:
             photos = len(read_scene(inputs["normalise"]).of_split("train"))
             seconds = max(MIN_SHARE_OF_SHAPE * seconds, seconds - _texture_seconds(config, photos, processors()))
         resolution = choose_resolution(seconds, inputs, progress)
-    return config.model_copy(update={"resolution": resolution, "max_faces": config.max_faces or faces, "frame": frame})
+    return config.model_copy(update={"resolution": resolution, "frame": frame})
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:

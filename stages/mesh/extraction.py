@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from stages.mesh import Config
 
 ISO_LEVEL_RAYS = 1024
+# Faces by default (docs/experiments/mesh.md): leaves take many, walls few.
+MIN_FACES, MAX_FACES, FACES_KEPT = 100_000, 300_000, 0.25
 COLOUR_SAMPLES = 8  # through the two voxels around a vertex
 PRINTED = ("stl", "3mf")  # read in millimetres by the programs that print
 BYTES_PER_POINT = 20  # density, occupancy, its averages and marching cubes; 16 measured at 208³
@@ -91,7 +93,6 @@ def load(inputs: Inputs, progress: Progress) -> Source:
 
 def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extracted:
     """The mesh of the field; ``config`` must be planned. Raises StageError without a surface."""
-    assert config.max_faces is not None
     box = grid_box(source.scene.capture_type, source.points)
     grid = _density_grid(config, source, box, progress)
     voxel = float(grid.spacing().max())
@@ -108,7 +109,8 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     cleaned = clean(
         raw, visibility, source.points, config.keep, min_views, config.min_component, source.scene.has_alpha
     )
-    surface = decimate(_cropped(config, cleaned.surface, source), config.max_faces, source.space)
+    cropped = _cropped(config, cleaned.surface, source)
+    surface = decimate(cropped, config.max_faces or default_faces(config, len(cropped.faces)), source.space)
     ends = boundary(surface, box, voxel, cropped=config.box is not None)
     if config.close:
         surface, closed = close_holes(surface, config.close)
@@ -122,6 +124,12 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     textured = _textured(config, surface, colours, source, voxel, progress)
     mesh = ColouredMesh(*surface, vertex_normals(surface), colours, textured and textured.texture)
     return Extracted(mesh, iso_level, cleaned, closed, ends, voxel, textured)
+
+
+def default_faces(config: "Config", found: int) -> int:
+    """How many of the faces ``found`` to keep. A smooth surface with a texture looks the same with fewer; without one,
+    each face shows a colour."""
+    return MAX_FACES if config.texture_size == 0 else min(MAX_FACES, max(MIN_FACES, round(FACES_KEPT * found)))
 
 
 def _cropped(config: "Config", surface: Surface, source: Source) -> Surface:

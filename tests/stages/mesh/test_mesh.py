@@ -377,12 +377,9 @@ def test_colours_that_are_not_finite_are_refused(run_mesh, tmp_path):
     assert list((tmp_path / "mesh").iterdir()) == []
 
 
-def test_faces_follow_whether_there_is_a_texture(tmp_path, progress):
-    write_json(tmp_path / "field.json", {"rays": 1000})
-    write_json(tmp_path / "scale.json", {"metres_per_unit": None})
-    for size, faces in ((4096, mesh.TEXTURED_FACES), (0, mesh.COLOURED_FACES)):
-        assert (
-            mesh.plan(mesh.Config(texture_size=size), {"train": tmp_path, "scale": tmp_path}, progress).max_faces
-            == faces
-        )
-    assert mesh.plan(mesh.Config(max_faces=500), {"train": tmp_path, "scale": tmp_path}, progress).max_faces == 500
+@pytest.mark.parametrize(
+    ("size", "found", "kept"),
+    [(4096, 50_000, 100_000), (4096, 800_000, 200_000), (4096, 9_000_000, 300_000), (0, 50_000, 300_000)],
+)
+def test_faces_follow_texture_and_surface(size, found, kept):
+    assert extraction.default_faces(mesh.Config(texture_size=size), found) == kept
