@@ -53,13 +53,20 @@ def fuse(photos: TrainingPhotos, read: ReadMap, known: int, tell: Callable[[floa
     for done, cloud in enumerate(in_order(of_photo, range(len(photos.views)), torch.device("cpu")), 1):
         clouds.append(cloud)
         tell(done / len(photos.views))
-    return PointCloud(*(np.concatenate(part) for part in zip(*clouds, strict=True)))
+    cloud = PointCloud(*(np.concatenate(part) for part in zip(*clouds, strict=True)))
+    share = min(1.0, MAX_POINTS / max(len(cloud.points), 1))  # the estimate may have been too low
+    drawn = np.diff(np.floor(np.arange(len(cloud.points) + 1) * share)) > 0
+    return cloud if share == 1 else PointCloud(*(part[drawn] for part in cloud))
 
 
 def _kept_share(photos: TrainingPhotos, read: ReadMap, others: list[list[int]]) -> float:
     """Which share of the known pixels become points, by some of the photos."""
     some = range(0, len(photos.views), -(-len(photos.views) // COUNTED_PHOTOS))
-    kept = sum(len(_of_photo(photos, read, number, others[number], 1.0).points) for number in some)
+
+    def count(number: int) -> int:
+        return len(_of_photo(photos, read, number, others[number], 1.0).points)
+
+    kept = sum(in_order(count, some, torch.device("cpu")))
     return max(kept, 1) / max(sum(int(np.count_nonzero(read(number).distance)) for number in some), 1)
 
 

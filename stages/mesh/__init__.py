@@ -115,7 +115,7 @@ def _texture_seconds(config: Config, photos: int, cores: int) -> float:
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Choose the resolution: from the training, or from what a texture leaves of ``seconds`` and the speed of this
-    machine; and the frame."""
+    machine; and the frame. The number of faces follows from the surface, once that is there."""
     from stages.mesh.resolution import choose_resolution
 
     metres = metres_per_unit(inputs["scale"])

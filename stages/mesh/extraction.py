@@ -111,7 +111,7 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     )
     cropped = _cropped(config, cleaned.surface, source)
     surface = decimate(cropped, config.max_faces or default_faces(config, len(cropped.faces)), source.space)
-    ends = boundary(surface, box, voxel, cropped=config.box is not None)
+    ends = boundary(surface, box, voxel, cropped=len(cropped.faces) < len(cleaned.surface.faces))
     if config.close:
         surface, closed = close_holes(surface, config.close)
         ends = "watertight" if is_watertight(surface) else ends

@@ -60,8 +60,8 @@ def shadow_maps(
 ) -> list[ShadowMap]:
     """One map per photo; together about ``NUM_RAYS`` rays, more of many photos, each with a sample per voxel of the
     longest edge. Masks lie in the folder of stage ``ingest``."""
-    maps = []
-    for number, view in enumerate(views):
+
+    def map_of(view: View) -> ShadowMap:
         camera = scene.cameras[view.camera]
         pixels, longer = camera.width * camera.height, max(camera.width, camera.height)
         shared = min((pixels * len(views) / NUM_RAYS) ** 0.5, longer / MIN_MAP_SIDE)
@@ -72,8 +72,12 @@ def shadow_maps(
         min_cosine = float((rays.directions.cpu().double().numpy() @ view.scene_from_camera[:, 2]).min())
         mask = view_mask(ingest, scene, view, max(1.0, max(camera.width, camera.height) / MAX_MASK_SIDE))
         depth = maximum_filter(depth, size=3, mode="nearest")
-        maps.append(ShadowMap(view, camera, rays, depth, min_cosine, None if mask is None else mask.numpy()))
-        on_view((number + 1) / len(views))
+        return ShadowMap(view, camera, rays, depth, min_cosine, None if mask is None else mask.numpy())
+
+    maps = []
+    for shadow_map in in_order(map_of, views, grid.low.device):
+        maps.append(shadow_map)
+        on_view(len(maps) / len(views))
     return maps
 
 

@@ -198,7 +198,12 @@ def _weak_groups(links: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str
     largest = sorted((link for link in links if len(link["photos"]) > 1), key=lambda link: -len(link["photos"]))
     shown = largest[:MAX_WEAK]
     groups = [
-        (f"Linked to the rest by {link['matches']} matches of {_pairs(link['pairs'])}", link["photos"])
+        (
+            f"Linked to the rest by {link['matches']} matches of {_pairs(link['pairs'])}"
+            if link["pairs"]
+            else "Linked to the rest by inexact matches alone",
+            link["photos"],
+        )
         for link in shown
     ]
     others = [file for link in links if link not in shown for file in link["photos"]]

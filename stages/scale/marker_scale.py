@@ -110,8 +110,6 @@ def _measured(marker: Marker, seen: Sequence[_Sighting], scene: Scene, progress:
     once = [sighting for sighting in seen if sighting.times == 1]
     if photos - len(once) > MAX_REPEATED * photos:
         return _unusable(marker, photos, REPEATED, progress)
-    if len(once) < 2:
-        return _unusable(marker, len(once), ONE_PHOTO, progress)
     square = fit_square(_sightings(once, scene))
     if square is None or square.agreeing.mean() < MIN_AGREEING:
         return _unusable(marker, photos, SEVERAL_PLACES, progress)

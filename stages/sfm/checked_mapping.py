@@ -123,14 +123,14 @@ def run_mapping(strategy: Strategy, database: Path, state: JobState) -> Mapped |
 def register_missing(strategy: Strategy, database: Path, state: JobState) -> Mapped:
     """As :func:`run_mapping`, going on from the best model so far, whose missing photos have new matches: as many of
     them as can be are registered in it."""
-    state.begin("mapping", done=0)
     best, seed, known = state.usable(), state.job.seed, state.job.camera_params is not None
     assert best is not None and strategy.mapping is not None, "only of a model are photos missing"
-    model, matches = load_native(state.log.model(best.name)), database
+    state.begin("mapping", done=len(best.groups[0]) - 1)
+    model, matches, hold_focal = load_native(state.log.model(best.name)), database, False
     if state.thinned:
         matches = state.sibling("missing-thinned")
-        thin_matches(database, matches, camera_is_known=True)
-    options = incremental_options(seed, strategy.mapping, known, state.thinned, hold_focal=state.thinned)
+        hold_focal = thin_matches(database, matches, camera_is_known=known) and strategy.mapping.hold_focal
+    options = incremental_options(seed, strategy.mapping, known, state.thinned, hold_focal)
     scratch = Path(state.job.folder, "again")
     model = register_again(model, check_model(model, database, seed), matches, state.images, scratch, options)
     checked = _checked(model, None, MappingInput(database, matches, options, set()), state)

@@ -214,16 +214,29 @@ def _try(strategy: Strategy, missing: list[int], state: JobState) -> None:
             fits=mapped.checked.fits,
             global_mapping=mapped.global_mapping,
         )
-        if adding and before:  # its other sub-models are as they were
-            still_excluded = {name: why for name, why in before.excluded.items() if name not in outcome.groups[0]}
-            outcome = replace(
-                outcome,
-                groups=[outcome.groups[0], *before.groups[1:]],
-                match_graph=before.match_graph,
-                conflict=before.conflict,
-                excluded=still_excluded | mapped.checked.excluded,
-            )
+        if adding and before:
+            outcome = _added_to(before, outcome)
     state.log.add(outcome)
+
+
+def _added_to(before: Outcome, after: Outcome) -> Outcome:
+    """The outcome of adding photos to a model, whose other sub-models are as they were. Without a photo more it is no
+    better than before."""
+    registered = after.groups[0]
+    conflict = before.conflict
+    if conflict is not None:
+        others = [file for file in conflict["others"] if file not in registered]
+        conflict = {**conflict, "others": others} if others else None
+    found = replace(
+        after,
+        groups=[registered, *before.groups[1:]],
+        match_graph=before.match_graph,
+        conflict=conflict,
+        excluded={file: why for file, why in before.excluded.items() if file not in registered} | after.excluded,
+    )
+    if len(registered) > len(before.groups[0]):
+        return found
+    return replace(found, points=min(found.points, before.points), reprojection_px=before.reprojection_px)
 
 
 def _files(model: Any) -> list[str]:

@@ -21,7 +21,7 @@ from stages.sfm.colmap.observations import Observations, noise_px, observations,
 
 # Points for the comparison are drawn until they have so many observations: 14 candidates then take seconds.
 MAX_OBSERVATIONS = 20_000
-MAX_PHOTOS = 150  # of a camera, those that share most points: more make the comparison longer and no surer
+MAX_PHOTOS = 150  # for each camera, those that share most points: more make the comparison longer and no surer
 MAX_OBSERVATIONS_PER_IMAGE = 100  # where there are hundreds of photos it takes more: a pose alone has 6 unknowns
 MIN_HELD_OUT = 50  # the spread of so many is known to a tenth, 1/√(2 · 50); fewer are no evidence
 CAP_PX = 4.0  # what is farther off is a mismatch, as for COLMAP's own filter, and counts as this
@@ -98,8 +98,9 @@ def _select(
 ) -> Selection:
     """Let every candidate predict what these cameras saw."""
     sample = _part(mapped, cameras)
-    photos = sample.num_reg_images()
-    most = max(MAX_OBSERVATIONS * photos // mapped.num_reg_images(), MAX_OBSERVATIONS_PER_IMAGE * photos)
+    photos = sum(mapped.image(image_id).camera_id in cameras for image_id in mapped.reg_image_ids())
+    per_image = MAX_OBSERVATIONS_PER_IMAGE * sample.num_reg_images()
+    most = max(MAX_OBSERVATIONS * photos // mapped.num_reg_images(), per_image)
     held_out = hold_out(sample, seed, most)
     if len(held_out.xy) < MIN_HELD_OUT:
         why = f"only {len(held_out.xy)} points appear in three photos, too few to compare camera models"
@@ -132,8 +133,8 @@ def _part(mapped: pycolmap.Reconstruction, cameras: list[int]) -> pycolmap.Recon
     for image_id in sorted(part.reg_image_ids()):
         if part.image(image_id).camera_id not in cameras:
             part.deregister_frame(part.image(image_id).frame_id)
-    if part.num_reg_images() > MAX_PHOTOS:
-        for image_id in set(part.reg_image_ids()) - best_covered(part, MAX_PHOTOS):
+    if part.num_reg_images() > (most := MAX_PHOTOS * len(cameras)):
+        for image_id in set(part.reg_image_ids()) - best_covered(part, most):
             part.deregister_frame(part.image(image_id).frame_id)
     return part
 
@@ -289,7 +290,7 @@ def _reason(chosen: CandidateResult | None, results: list[CandidateResult], cell
     sound = [result for result in results if not result.why_degenerate]
     simpler = [result for result in sound if result.candidate.complexity < chosen.candidate.complexity]
     if not simpler:
-        return f"{error}, and no model with more parameters is better by more than the noise"
+        return f"{error}, and no model with more parameters is better by more than the noise or a thousandth"
     best = min(simpler, key=lambda result: result.error_px.mean())
     worse, noise = paired(best.error_px - chosen.error_px, cells)
     name = f"{best.candidate.model} ({best.candidate.principal_point_state})"

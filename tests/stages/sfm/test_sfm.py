@@ -187,7 +187,7 @@ def test_strangers_are_named_alpha_and_mixed_sizes_work(inputs: dict[str, Path],
     assert [image["file"] for image in account["images"] if not image["registered"]] == ["stranger.png"]
     tried = {row["strategy"]: row["skipped"] for row in account["strategies"]}
     assert list(tried) == [strategy.name for strategy in STRATEGIES if strategy.matches != "consecutive"]
-    assert [name for name, skipped in tried.items() if skipped is None] == ["default", "relaxed ratio test"]
+    assert [name for name, skipped in tried.items() if skipped is None] == ["default", "missing photos"]
     assert "1 of 9 photos" in tried["fisheye"]
     assert [row["strategy"] for row in account["strategies"] if row["kept"]] == ["default"]
     assert account["repeated_structure"] is None
@@ -318,20 +318,20 @@ def test_a_strategy_that_ended_the_worker_is_skipped(
     crash = (
         "import sys, stages.sfm.worker as c, os\n"
         "first = c.match_photos\n"
-        f"c.match_photos = lambda a, m, w: {end} if a.name == 'relaxed ratio test' else first(a, m, w)\n"
+        f"c.match_photos = lambda a, m, w: {end} if a.name == 'missing photos' else first(a, m, w)\n"
         "c.main()"
     )
     with monkeypatch.context() as patched:
         patched.setattr(worker_process, "COMMAND", ["-c", crash])
-        with refused(f"sfm.{message[0]}", *message[1:], "'relaxed ratio test'"):
+        with refused(f"sfm.{message[0]}", *message[1:], "'missing photos'"):
             run_stage(sfm, SMALL, folders, tmp_path / "sfm", progress)
     progress.clear()
     result = run_stage(sfm, SMALL, folders, tmp_path / "sfm", progress)
     assert result.line.startswith("6/7 registered, ")
     assert progress.codes[0] == "sfm.resumes" and progress.names("sfm.resumes", "7 photos", "21 matched pairs")
-    assert progress.names("sfm.strategy-failed-before", became, "relaxed ratio test")
+    assert progress.names("sfm.strategy-failed-before", became, "registering them in the model")
     tried = {row["strategy"]: row["skipped"] for row in read_json(tmp_path / "sfm/registration.json")["strategies"]}
-    assert became in tried["relaxed ratio test"]
+    assert became in tried["missing photos"]
     assert not (tmp_path / "sfm/strategies").exists()
 
 
@@ -352,11 +352,11 @@ def test_a_strategy_for_which_no_time_is_left_is_skipped(
     result = run_stage(sfm, config, with_a_stranger(inputs, tmp_path / "ingest"), tmp_path / "sfm", progress)
     assert result.line.startswith("6/7 registered, ")
     assert result.line.endswith(" · 1 retry strategy skipped for time: sfm --force")
-    # All of the first time's 100 s of mapping, 1 - (6/7)² of those of matching; twice 100 s are for the adjustment.
-    values = ("about 2 min", "4 min of --sfm.max-seconds", "relaxed ratio test")
+    # Of the first time's 100 s of mapping 0.4, of those of matching 4 / 7; twice 100 s are for the adjustment.
+    values = ("about 2 min", "4 min of --sfm.max-seconds", "registering them in the model")
     assert progress.names("sfm.strategy-too-slow", *values)
     tried = {row["strategy"]: row["skipped"] for row in read_json(tmp_path / "sfm/registration.json")["strategies"]}
-    assert "--sfm.max-seconds" in tried["relaxed ratio test"]
+    assert "--sfm.max-seconds" in tried["missing photos"]
     assert "too few matches" in tried["weaker initial pair"]
 
 

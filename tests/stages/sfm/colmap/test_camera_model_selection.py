@@ -7,7 +7,7 @@ import pytest
 
 from nerf.geometry.scene import Camera
 from stages.sfm.colmap import final_bundle_adjustment, intrinsics
-from stages.sfm.colmap.camera_model_selection import CameraModels, choose, hold_out, paired
+from stages.sfm.colmap.camera_model_selection import CameraModels, best_covered, choose, hold_out, paired
 from stages.sfm.colmap.cameras import native
 from stages.sfm.colmap.intrinsics import MODELS, CameraModelCandidate, set_camera_models, why_degenerate
 from stages.sfm.colmap.observations import noise_px, observations, residuals
@@ -62,6 +62,19 @@ def test_the_choice_repeats_and_says_why() -> None:
     best = min(choice.table, key=lambda row: row["held_out_px"] or 9)
     assert (best["worse_px"], best["noise_px"]) == (0, 0)
     assert choice.notes[0].code == "sfm.camera-model" and "SIMPLE_RADIAL" in choice.notes[0].text
+
+
+def test_many_photos_are_judged_by_those_that_share_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = mapped(photographed(BARREL, points=200))
+    everyone = set(model.reg_image_ids())
+    some = best_covered(model, 5)
+    assert len(some) == 5 and some < everyone and best_covered(model, 5) == some
+    assert best_covered(model, 1000) == everyone
+    monkeypatch.setattr("stages.sfm.colmap.camera_model_selection.MAX_PHOTOS", 5)
+    choice = choose(model, seed=0)
+    assert {row["photos"] for row in choice.table} == {len(everyone)}, "of all these photos the camera is chosen"
+    assert len(set(model.reg_image_ids())) == len(everyone), "the model itself stays"
+    assert choice.chosen[1].model == "SIMPLE_RADIAL"
 
 
 def test_without_evidence_it_stays_simple() -> None:
