@@ -16,12 +16,12 @@ from tests.drills.drill import Prepare, Program, copy_workspace, results, run_wo
 
 # How a program that got a signal ends: its exit code, and the code of its last event.
 ENDS = {signal.SIGINT: (130, "pipeline.interrupted"), signal.SIGTERM: (143, "pipeline.terminated")}
-RELAXED = next(strategy for strategy in STRATEGIES if strategy.matches == "relaxed")
+RETRY = next(strategy for strategy in STRATEGIES if strategy.matches == "missing")
 # How the events of sfm tell where it is; two by a note, for the live line may miss what takes less than half a second.
 SFM_INSTANTS = {
     "features": lambda event: event.get("done") is not None,
     "matching": lambda event: event["event"] == "note" and event["message"].startswith("matching "),
-    RELAXED.name: lambda event: event.get("code") == "sfm.strategy" and event["message"].endswith(RELAXED.description),
+    RETRY.name: lambda event: event.get("code") == "sfm.strategy" and event["message"].endswith(RETRY.description),
     "final bundle adjustment": lambda event: event.get("done") == REFINING,
 }
 

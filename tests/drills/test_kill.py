@@ -14,7 +14,7 @@ from PIL import Image
 
 from pipeline.engine.stage_list import usual
 from stages.sfm.worker_process import FIRST_STRATEGY, PHASES, REFINING
-from tests.drills.campaigns import RELAXED, SFM_INSTANTS, Chain, reached
+from tests.drills.campaigns import RETRY, SFM_INSTANTS, Chain, reached
 from tests.drills.drill import Program, copy_workspace, results
 from tests.synthetic_photos import SyntheticPhotos
 
@@ -76,7 +76,7 @@ def test_a_killed_video_resumes_at_the_chosen_size(chain: Chain, tmp_path: Path)
 
 @pytest.fixture
 def photos_and_a_stranger(synthetic_photos: SyntheticPhotos, tmp_path: Path) -> Path:
-    """Seven photos that overlap and one of something else, which only a second, less strict matching can look for."""
+    """Seven photos that overlap and one of something else, which only a retry can look for."""
     folder = tmp_path / "photos"
     folder.mkdir()
     for photo in sorted(synthetic_photos.folder.iterdir())[:7]:
@@ -91,7 +91,7 @@ def test_killed_while_photos_are_matched(photos_and_a_stranger: Path, tmp_path: 
         words = ["run", str(photos_and_a_stranger), "-o", str(tmp_path / name), "--json", "--until", "sfm"]
         return Program([*words, "--sfm.max-features", "800"], tmp_path / "says")
 
-    assert reached(RELAXED.name, sfm("undisturbed.nerf").finish().events())
+    assert reached(RETRY.name, sfm("undisturbed.nerf").finish().events())
     delays = random.Random(3)
     for instant in SFM_INSTANTS:
         program = sfm("killed.nerf")
@@ -102,5 +102,5 @@ def test_killed_while_photos_are_matched(photos_and_a_stranger: Path, tmp_path: 
     events = sfm("killed.nerf").finish().events()
     done = {event["done"] for event in events if event["event"] == "progress" and event["stage"] == "sfm"}
     assert done <= {None, FEATURES_FOUND, REFINING}, "only the final bundle adjustment was left to do"
-    assert not reached("matching", events) and not reached(RELAXED.name, events)
+    assert not reached("matching", events) and not reached(RETRY.name, events)
     assert results(tmp_path / "killed.nerf") == results(tmp_path / "undisturbed.nerf")
