@@ -27,7 +27,7 @@ def test_matches_are_read_only_where_they_decide(missing: int, tmp_path: Path, m
     assert len(read) == (missing > 1)
 
 
-def test_photos_added_to_a_model_leave_the_rest_as_it_was() -> None:
+def test_photos_added_to_a_model_change_nothing_else() -> None:
     why, conflict = Note("sfm.x", "why"), {"group": 1, "photos": ["a"], "others": ["c", "d"]}
     before = Outcome(
         "default", "x.db", [["a", "b"], ["c", "d"]], 90, 0.4, conflict, {}, {"tried": 3}, {"c": why, "e": why}

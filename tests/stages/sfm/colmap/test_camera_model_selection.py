@@ -64,7 +64,7 @@ def test_the_choice_repeats_and_says_why() -> None:
     assert choice.notes[0].code == "sfm.camera-model" and "SIMPLE_RADIAL" in choice.notes[0].text
 
 
-def test_many_photos_are_judged_by_those_that_share_most(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_photos_are_judged_by_the_best_covered(monkeypatch: pytest.MonkeyPatch) -> None:
     model = mapped(photographed(BARREL, points=200))
     everyone = set(model.reg_image_ids())
     some = best_covered(model, 5)
