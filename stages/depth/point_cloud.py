@@ -55,8 +55,12 @@ def fuse(photos: TrainingPhotos, read: ReadMap, known: int, tell: Callable[[floa
         tell(done / len(photos.views))
     cloud = PointCloud(*(np.concatenate(part) for part in zip(*clouds, strict=True)))
     share = min(1.0, MAX_POINTS / max(len(cloud.points), 1))  # the estimate may have been too low
-    drawn = np.diff(np.floor(np.arange(len(cloud.points) + 1) * share)) > 0
-    return cloud if share == 1 else PointCloud(*(part[drawn] for part in cloud))
+    return cloud if share == 1 else PointCloud(*(part[_evenly(len(part), share)] for part in cloud))
+
+
+def _evenly(count: int, share: float) -> Bool[np.ndarray, "count"]:
+    """A ``share`` of so many, evenly."""
+    return np.diff(np.floor(np.arange(count + 1) * share)) > 0
 
 
 def _kept_share(photos: TrainingPhotos, read: ReadMap, others: list[list[int]]) -> float:
@@ -101,7 +105,7 @@ def _of_photo(photos: TrainingPhotos, read: ReadMap, number: int, others: list[i
         finest &= ~(agrees & finer)
         colours.append(np.where(agrees[:, None], colour, np.float32(np.nan)))
     kept = np.flatnonzero(finest & (agreeing > 1) & (agreeing > seen_through))
-    kept = kept[np.diff(np.floor(np.arange(len(kept) + 1) * share)) > 0]
+    kept = kept[_evenly(len(kept), share)]
     colour = _medians(np.stack([one[kept] for one in colours]))
     normal = normals(viewpoint, depth)[row[kept], column[kept]] @ rotation.T
     return PointCloud(points[kept], normal, np.rint(colour).astype(np.uint8), agreeing[kept].astype(np.uint8))

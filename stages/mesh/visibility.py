@@ -70,7 +70,7 @@ def shadow_maps(
         rays = rays.each(lambda part: part.to(grid.low.device))
         depth = median_depth(grid, rays, max(grid.values.shape)).cpu().numpy()
         min_cosine = float((rays.directions.cpu().double().numpy() @ view.scene_from_camera[:, 2]).min())
-        mask = view_mask(ingest, scene, view, max(1.0, max(camera.width, camera.height) / MAX_MASK_SIDE))
+        mask = view_mask(ingest, scene, view, max(1.0, longer / MAX_MASK_SIDE))
         depth = maximum_filter(depth, size=3, mode="nearest")
         return ShadowMap(view, camera, rays, depth, min_cosine, None if mask is None else mask.numpy())
 

@@ -8,6 +8,7 @@ model that is too simple bends the poses; one that is too rich fits noise, and b
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from scipy.sparse import csr_matrix
 from stages.contract import Note
 from stages.sfm.colmap.intrinsics import MODELS, CameraModelCandidate, degenerate_cameras, set_camera_models
 from stages.sfm.colmap.observations import Observations, noise_px, observations, residuals
+from stages.sfm.pairs.match_graph import most_linked
 
 # Points for the comparison are drawn until they have so many observations: 14 candidates then take seconds.
 MAX_OBSERVATIONS = 20_000
@@ -153,13 +155,7 @@ def best_covered(model: pycolmap.Reconstruction, count: int) -> set[int]:
     sees = csr_matrix((np.ones(len(image)), (image, point)), (len(ids), model.num_points3D()))
     shared: Float[np.ndarray, "images images"] = (sees @ sees.T).toarray()
     np.fill_diagonal(shared, 0)
-    taken = [int(shared.sum(axis=1).argmax())]
-    towards = shared[taken[0]].copy()
-    while len(taken) < min(count, len(ids)):
-        towards[taken] = -1
-        taken.append(int(towards.argmax()))
-        towards += shared[taken[-1]]
-    return {ids[index] for index in taken}
+    return {ids[photo] for photo, _ in islice(most_linked(shared), count)}
 
 
 def hold_out(model: pycolmap.Reconstruction, seed: int, most: int) -> Observations:

@@ -6,6 +6,7 @@ the final adjustment brings back all matches (stages/sfm/colmap/final_bundle_adj
 """
 
 import math
+from itertools import islice, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from stages.sfm.colmap.correspondences import Correspondences, read_correspondences
 from stages.sfm.colmap.database import FOCAL_GUESS, finish_copy, keep_inliers, unfinished_copy
-from stages.sfm.pairs.match_graph import inlier_matrix
+from stages.sfm.pairs.match_graph import inlier_matrix, most_linked
 
 TRACKS_PER_PHOTO = 500  # of mapping: 1,000 take 1.7 times as long and move no camera by more (docs/stages/sfm.md)
 CALIBRATION_STARTS = 0.5, 2.0  # × the guess; where pairs tell the focal length, both lead to the same within 1 %
@@ -157,11 +158,5 @@ def best_linked(database: Path, count: int) -> list[str]:
         pair_ids, inliers = db.read_two_view_geometry_num_inliers()
     pairs = np.array([pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids], int).reshape(-1, 2) - 1
     strength = np.maximum(inlier_matrix(len(names), pairs, np.array(inliers, int)), 0)  # none where none was tried
-    taken = [int(strength.sum(axis=1).argmax())]
-    while len(taken) < min(count, len(names)):
-        towards = strength[taken].sum(axis=0)
-        towards[taken] = 0
-        if not towards.any():
-            break
-        taken.append(int(towards.argmax()))
-    return [names[number] for number in taken]
+    linked = takewhile(lambda one: one.links > 0, most_linked(strength))
+    return [names[photo] for photo, _ in islice(linked, count)]

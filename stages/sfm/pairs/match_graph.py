@@ -7,12 +7,13 @@ the graph's weak cuts, until every photo has been tried with enough others.
 ``inliers`` is symmetric: the verified matches of each pair, 0 where a pair failed, UNTESTED where it was not tried.
 """
 
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Num
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
@@ -126,6 +127,26 @@ def weak_cuts(weight: Float[np.ndarray, "photos photos"]) -> Cuts:
         np.einsum("ci,ci->c", side.astype(float) @ of, (~side).astype(float)) for of in (1.0 * (weight > 0), weight)
     )
     return Cuts(side, np.rint(edges).astype(int), across)
+
+
+class Linked(NamedTuple):
+    """A photo, and how strongly it is linked with those before it; infinitely, for the first."""
+
+    photo: int
+    links: float
+
+
+def most_linked(strength: Num[np.ndarray, "photos photos"]) -> Iterator[Linked]:
+    """All photos in the order in which they hang together: the one that is linked most, then again and again the one
+    that is linked most with those before. ``strength`` is symmetric and has no photo linked with itself."""
+    photo, links, taken = int(strength.sum(axis=1).argmax()), math.inf, np.zeros(len(strength), bool)
+    towards = np.zeros(len(strength))
+    for _ in range(len(strength)):
+        yield Linked(photo, links)
+        taken[photo] = True
+        towards += strength[photo]
+        photo = int(np.where(taken, -1, towards).argmax())
+        links = float(towards[photo])
 
 
 def connected(edges: Bool[np.ndarray, "photos photos"]) -> Int[np.ndarray, "photos"]:
