@@ -30,6 +30,7 @@ from nerf.kernels import warp
 from nerf.rendering.images import render_image
 from nerf.runtime.ranks import Ranks
 from nerf.training.data_parallel import LeadingTrainer
+from nerf.training.graph_trainer import GraphTrainer
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from nerf.training.metrics import mean_squared_error, psnr
 from nerf.training.ray_dataset import RayDataset
@@ -53,7 +54,7 @@ def load(file: Path, photos: Path) -> tuple[dict[str, RayDataset], bool]:
     return datasets, facts["bounded"]
 
 
-def new_trainer(dataset: RayDataset, bounded: bool, target_samples: int) -> HashGridTrainer:
+def new_trainer(dataset: RayDataset, bounded: bool, target_samples: int, graph: bool = True) -> HashGridTrainer:
     """A fresh field and its trainer, with the sizes that stages/train gives a large budget on a GPU."""
     alpha = dataset.pixels.shape[1] == 4
     sizes: dict[str, Any] = {"num_levels": 8, "log2_hashmap_size": 20}
@@ -74,7 +75,7 @@ def new_trainer(dataset: RayDataset, bounded: bool, target_samples: int) -> Hash
     how = HashGridTrainerSettings(
         0, "random" if alpha else (0.0, 0.0, 0.0), target_samples, learning_rate=LEARNING_RATE, **losses
     )
-    return HashGridTrainer(field, dataset, how)
+    return (GraphTrainer if graph else HashGridTrainer)(field, dataset, how)
 
 
 def joined() -> Ranks:
@@ -154,7 +155,7 @@ def run(given: argparse.Namespace) -> None:
     torch.set_float32_matmul_precision(given.matmul)
     ranks = joined() if given.exchange else None
     for seconds in given.seconds:
-        trainer = new_trainer(datasets["train"], bounded, given.target_samples)
+        trainer = new_trainer(datasets["train"], bounded, given.target_samples, given.graph)
         if ranks is not None:
             trainer = LeadingTrainer(trainer, 0, ranks)
         trained = train(trainer, seconds)
@@ -162,6 +163,7 @@ def run(given: argparse.Namespace) -> None:
             set=given.file.stem,
             train_seconds=seconds,
             matmul=given.matmul,
+            graph=given.graph and not given.exchange,
             exchange="" if ranks is None else ranks.backend,
             **score(trainer.model, datasets["test"]),
             **trained,
@@ -177,6 +179,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, nargs="+", default=[10.0])
     parser.add_argument("--target-samples", type=int, default=TARGET_SAMPLES)
     parser.add_argument("--matmul", choices=("highest", "high", "medium"), default="highest")
+    parser.add_argument("--no-graph", dest="graph", action="store_false", help="launch operations one by one")
     parser.add_argument("--exchange", action="store_true", help="by torchrun's ranks, as several GPUs do")
     parser.add_argument("--profile", action="store_true", help="kernels of a step and of a frame, after the last run")
     add_out(parser)

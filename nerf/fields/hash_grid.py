@@ -5,12 +5,12 @@ its occupied cells alone, and the density found there decides how far along a ra
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor, nn
 
 from nerf.fields import mlp
@@ -23,7 +23,12 @@ from nerf.geometry.space_maps.mapped_rays import MappedRays
 from nerf.geometry.space_maps.ndc import Ndc
 from nerf.kernels import Backend, BinaryOccupancy, GridLayout, RayStepping, Samples, grid_layout
 from nerf.kernels.torch.occupancy import binary_occupancy, cell_numbers, is_occupied
-from nerf.rendering.early_termination import EARLY_STOP_TRANSMITTANCE, MarchingRound, march_with_early_termination
+from nerf.rendering.early_termination import (
+    EARLY_STOP_TRANSMITTANCE,
+    MarchingRound,
+    RoundSize,
+    march_with_early_termination,
+)
 from nerf.runtime.profiler import WorkCounts, span
 from nerf.runtime.randomness import generator
 
@@ -124,15 +129,26 @@ class HashGridSettings:
         )
 
 
+class SamplePlan(NamedTuple):
+    """For how many samples there is room: in each round of marching, and among the visible ones. With a plan the host
+    need not wait for a GPU to count them."""
+
+    rounds: tuple[RoundSize, ...]
+    visible: int
+
+
 class HashGridPass(NamedTuple):
-    """What a rendering computed on its way, for :meth:`HashGridField.backward`. ``density_evaluations``: how many
-    points the density was evaluated at. ``optical_thickness`` is that of the samples' own intervals, before thinning.
-    ``samples`` stand at distances along the ``mapped`` rays, for lengths in the scene."""
+    """What a rendering computed on its way, for :meth:`HashGridField.backward`. ``room`` is the plan it was given, or
+    one that has just room for its samples. ``density_evaluations``: how many points the density was evaluated at.
+    ``fits``: whether there was room for all samples. ``optical_thickness`` is that of the samples' own intervals,
+    before thinning. ``samples`` stand at distances along the ``mapped`` rays, for lengths in the scene."""
 
     rays: Rays
     mapped: MappedRays
     background: Float[Tensor, "rays 3"]
-    density_evaluations: int
+    room: SamplePlan
+    density_evaluations: Int32[Tensor, ""]
+    fits: Bool[Tensor, ""]
     samples: Samples
     points: Float[Tensor, "samples 3"]
     optical_thickness: Float[Tensor, "samples"]
@@ -252,7 +268,7 @@ class HashGridField(nn.Module):
         depth = torch.zeros_like(rays.far, dtype=torch.float64)
         ray_hidden = mlp.direction_hidden(self.weights, self.encode_directions(rays.directions))
         mapped = self.space.map_rays(rays)
-        for samples, _, density in self._march(mapped, torch.full_like(rays.near, 0.5), self.render_stepping):
+        for _, samples, _, density in self._march(mapped, torch.full_like(rays.near, 0.5), self.render_stepping):
             with span("composite"):
                 samples = _in_scene(mapped, samples)
                 selected = backend.select_colour_samples(samples, density.sigma, OPACITY_STEP, depth, accumulated)
@@ -271,17 +287,24 @@ class HashGridField(nn.Module):
         jitter: Float[Tensor, "rays"],
         thinning_offset: Float[Tensor, "rays"],
         background: Float[Tensor, "rays 3"],
+        plan: SamplePlan | None = None,
     ) -> HashGridPass:
         """Density of all samples in occupied cells; colour of the visible ones, thinned by ``thinning_offset``
-        (``Backend.visible_samples``)."""
+        (``Backend.visible_samples``). With a ``plan`` arrays of samples have its lengths, with padding at their end
+        (nerf/kernels)."""
         backend, rays = self.backend, rays.each(Tensor.contiguous)
         background, mapped = self._background_of(rays, background), self.space.map_rays(rays)
-        rounds = list(self._march(mapped, jitter, self.stepping))
+        rounds = list(self._march(mapped, jitter, self.stepping, plan and plan.rounds))
         with span("march"):
             marched, order = backend.pack_rounds([each.samples for each in rounds])
             sigma = torch.cat([each.density.sigma for each in rounds]).index_select(0, order)
             samples, seen = backend.visible_samples(
-                marched, sigma, EARLY_STOP_TRANSMITTANCE, THINNING_THRESHOLD, thinning_offset
+                marched,
+                sigma,
+                EARLY_STOP_TRANSMITTANCE,
+                THINNING_THRESHOLD,
+                thinning_offset,
+                capacity=plan and plan.visible,
             )
             rows = order.index_select(0, seen)
             points = torch.cat([each.points for each in rounds]).index_select(0, rows)
@@ -298,8 +321,18 @@ class HashGridField(nn.Module):
         with span("composite"):
             of_scene = _in_scene(mapped, samples)
             rendering, weights = backend.composite(of_scene, density.sigma, colour.colour, background, rays.far)
+        room = SamplePlan(tuple(RoundSize(each.per_ray, len(each.points)) for each in rounds), len(points))
+        fits = jitter.new_ones((), dtype=torch.bool) if plan is None else self._fits(rounds, samples)
         of_samples = samples, points, optical_thickness, density
-        return HashGridPass(rays, mapped, background, len(order), *of_samples, harmonics, colour, rendering, weights)
+        of_plan = room, marched.starts[-1], fits
+        return HashGridPass(rays, mapped, background, *of_plan, *of_samples, harmonics, colour, rendering, weights)
+
+    def _fits(self, rounds: Sequence[MarchingRound], visible: Samples) -> Bool[Tensor, ""]:
+        """Whether no array of samples is full, and no ray goes on behind the last round."""
+        not_full = [each.starts[-1] < len(each.t) for each in (*(one.samples for one in rounds), visible)]
+        if sum(each.per_ray for each in rounds) < self.stepping.max_samples:
+            not_full.append((rounds[-1].samples.starts.diff() < rounds[-1].per_ray).all())
+        return torch.stack(not_full).all()
 
     def backward(
         self, forward_pass: HashGridPass, grad: Rendering, grad_weights: Float[Tensor, "samples"]
@@ -355,7 +388,13 @@ class HashGridField(nn.Module):
             else background
         )
 
-    def _march(self, rays: MappedRays, jitter: Float[Tensor, "rays"], stepping: RayStepping) -> Iterator[MarchingRound]:
+    def _march(
+        self,
+        rays: MappedRays,
+        jitter: Float[Tensor, "rays"],
+        stepping: RayStepping,
+        sizes: Sequence[RoundSize] | None = None,
+    ) -> Iterator[MarchingRound]:
         return march_with_early_termination(
             self.backend,
             BinaryOccupancy(self.occupancy_bits, self.empty_distance),
@@ -363,6 +402,7 @@ class HashGridField(nn.Module):
             self._density_pass,
             rays,
             jitter,
+            sizes,
         )
 
     def _density_pass(self, unit: Float[Tensor, "points 3"]) -> DensityPass:

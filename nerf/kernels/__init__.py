@@ -11,6 +11,9 @@ torch, any device, float32 or float64. The contract:
   the results and returns, or adds to, the one with respect to the arguments. Sample distances carry no gradient.
 * Samples are *packed*: those of ray r are the entries starts[r] ... starts[r + 1] - 1, front to back. A ray may have
   none.
+* A function that takes a ``capacity`` returns that many entries, whatever it counts: the host, which gives the tensors
+  their lengths, need not wait for a GPU to count. Entries from starts[-1] on are *padding*: zeros that belong to no ray
+  and have no gradient. What finds no place is left out, and then starts[-1] is the capacity.
 * Points given to the hash grid or the occupancy grid are in *unit coordinates*: [0, 1]^3 is the cube of the scene's
   space map (nerf/geometry/space_maps): [-0.9, 0.9]^3 of a bounded scene or of normalised device coordinates, or the
   contracted space [-2, 2]^3.
@@ -133,10 +136,18 @@ class ColourSamples(NamedTuple):
 
 @runtime_checkable
 class Backend(Protocol):
-    """The functions of a backend module; their docstrings are in ``nerf.kernels.torch``."""
+    """The functions of a backend module; their docstrings are in ``nerf.kernels.torch``. ``CAPTURABLE``: whether a CUDA
+    graph may hold them, where they are given capacities."""
+
+    CAPTURABLE: bool
 
     def march(
-        self, occupied: BinaryOccupancy, stepping: RayStepping, rays: Rays, jitter: Float[Tensor, "rays"]
+        self,
+        occupied: BinaryOccupancy,
+        stepping: RayStepping,
+        rays: Rays,
+        jitter: Float[Tensor, "rays"],
+        capacity: int | None = None,
     ) -> Samples: ...
 
     def sample_points(self, rays: Rays, samples: Samples, contracted: bool) -> Float[Tensor, "samples 3"]: ...
@@ -207,6 +218,7 @@ class Backend(Protocol):
         threshold: float,
         thinning_threshold: float,
         thinning_offset: Float[Tensor, "rays"],
+        capacity: int | None = None,
     ) -> tuple[Samples, Int32[Tensor, "kept"]]: ...
 
     def composite(

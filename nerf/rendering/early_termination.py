@@ -4,7 +4,7 @@ Nothing behind an opaque surface needs to be computed, but only the densities te
 those of the next samples of all rays that are not yet opaque.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -24,9 +24,17 @@ ROUND_SAMPLES = {"cpu": 1 << 14, "cuda": 1 << 20}
 MIN_ROUND_SAMPLES_PER_RAY, MAX_ROUND_SAMPLES_PER_RAY = 6, {"cpu": 64, "cuda": 256}
 
 
-class MarchingRound(NamedTuple):
-    """The next samples of all rays; a ray that has ended has none."""
+class RoundSize(NamedTuple):
+    """Of a round: how many samples a ray may have, and all rays together (a ``capacity`` of nerf/kernels)."""
 
+    per_ray: int
+    capacity: int
+
+
+class MarchingRound(NamedTuple):
+    """The next samples of all rays, of which each might have ``per_ray``; a ray that has ended has none."""
+
+    per_ray: int
     samples: Samples
     points: Float[Tensor, "samples 3"]
     density: DensityPass
@@ -39,30 +47,40 @@ def march_with_early_termination(
     density_at: Callable[[Float[Tensor, "points 3"]], DensityPass],
     mapped: MappedRays,
     jitter: Float[Tensor, "rays"],
+    sizes: Sequence[RoundSize] | None = None,
 ) -> Iterator[MarchingRound]:
     """The samples of rays in occupied cells up to where their transmittance falls below EARLY_STOP_TRANSMITTANCE,
-    ``stepping.max_samples`` per ray at most, in one round or more. There must be rays.
+    ``stepping.max_samples`` per ray at most, in one round or more. There must be rays. ``sizes``: of the rounds, where
+    the host is not to wait for a GPU after each of them to choose the next; what they have no room for is missing.
 
     Samples stand where :meth:`Backend.march` puts them: each round goes on where the last has ended. ``density_at``
     takes points in unit coordinates. Samples have distances along the ``mapped`` rays and lengths in the scene.
     """
     rays = mapped.rays
-    active_rays, near = len(jitter), rays.near.clone()
-    optical_depth, taken = torch.zeros_like(jitter, dtype=torch.float64), 0
-    while active_rays and taken < stepping.max_samples:
-        length = _samples_per_ray(active_rays, jitter.device)
-        this_round = stepping._replace(max_samples=min(length, stepping.max_samples - taken))
+    near, optical_depth = rays.near.clone(), torch.zeros_like(jitter, dtype=torch.float64)
+    adaptive = ((per_ray, None) for per_ray in _adaptive_sizes(stepping.max_samples, near, rays.far))
+    for per_ray, capacity in adaptive if sizes is None else sizes:
+        this_round = stepping._replace(max_samples=per_ray)
         with span("march"):
-            samples = backend.march(occupancy, this_round, rays._replace(near=near), jitter)
+            samples = backend.march(occupancy, this_round, rays._replace(near=near), jitter, capacity)
             samples = samples._replace(dt=samples.dt * mapped.scene_length(samples.t, samples.ray))
             points = backend.sample_points(rays, samples, stepping.contracted)
         density = density_at(points)
-        yield MarchingRound(samples, points, density)
+        yield MarchingRound(per_ray, samples, points, density)
         with span("march"):
             backend.finish_round(
                 this_round, samples, density.sigma, EARLY_STOP_TRANSMITTANCE, jitter, rays.far, optical_depth, near
             )
-            taken, active_rays = taken + this_round.max_samples, int((near < rays.far).sum())
+
+
+def _adaptive_sizes(max_samples: int, near: Float[Tensor, "rays"], far: Float[Tensor, "rays"]) -> Iterator[int]:
+    """Samples per ray of rounds, up to where all rays have ended; ``near`` moves on between them."""
+    active_rays, taken = len(near), 0
+    while active_rays and taken < max_samples:
+        per_ray = min(_samples_per_ray(active_rays, near.device), max_samples - taken)
+        yield per_ray
+        with span("march"):
+            taken, active_rays = taken + per_ray, int((near < far).sum())
 
 
 def _samples_per_ray(rays: int, device: torch.device) -> int:

@@ -91,6 +91,11 @@ def profiling(profiler: Profiler) -> Iterator[None]:
         _running = None
 
 
+def is_profiling() -> bool:
+    """Whether a profiler runs."""
+    return _running is not None
+
+
 def span(name: str, work: WorkCounts = NO_WORK) -> AbstractContextManager[None]:
     """For the running profiler, if there is one: what the block does is the span ``name``."""
     return UNTIMED if _running is None else _running.span(name, work)

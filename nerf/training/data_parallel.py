@@ -28,7 +28,8 @@ from nerf.fields.mlp import Weights
 from nerf.runtime.parallel import in_order
 from nerf.runtime.profiler import span
 from nerf.runtime.ranks import Ranks, packed, packed_bytes, unpacker
-from nerf.training.hash_grid_trainer import HashGridTrainer, MicroBatch
+from nerf.training.hash_grid_trainer import HashGridTrainer
+from nerf.training.micro_batch import MicroBatch
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite, StepResult
 
 STEP, STATE, END = 0.0, 1.0, 2.0  # what rank 0 may ask for
@@ -79,7 +80,7 @@ class RankExchange:
         most = -(-count // self.ranks.size)
         counts = [int(failed), len(own)] + [0] * (2 * most)
         for index, each in enumerate(own):
-            counts[2 + 2 * index : 4 + 2 * index] = len(each.points), each.density_evaluations
+            counts[2 + 2 * index : 4 + 2 * index] = len(each.points), int(each.density_evaluations)
         gathered = self.ranks.gather_counts(counts)
         if any(row[0] for row in gathered):
             return None
@@ -144,7 +145,10 @@ class RankExchange:
             points=of_samples(like.points),
             optical_thickness=of_samples(like.optical_thickness),
             grad_features=like.grad_features[:0] if self.is_dense else of_samples(like.grad_features),
-            density_evaluations=sizes.density_evaluations,
+            colour_evaluations=torch.tensor(sizes.samples, dtype=torch.int32),
+            density_evaluations=torch.tensor(sizes.density_evaluations, dtype=torch.int32),
+            room=like.room,
+            fits=like.fits,
         )
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from nerf.effects import NO_EFFECTS, Effect, ImageEffects, RayGradients, RenderedRays, parameters_of
 from nerf.fields import mlp
 from nerf.fields.background import BACKGROUND_LR_SCALE, BACKGROUND_PRIOR
-from nerf.fields.hash_grid import CORNERS, HashGridField, HashGridPass
+from nerf.fields.hash_grid import CORNERS, HashGridField, HashGridPass, SamplePlan
 from nerf.fields.interface import Rendering
 from nerf.fields.mlp import Weights
 from nerf.fields.occupancy_grid import OccupancyGrid
@@ -24,6 +24,7 @@ from nerf.training.colour_loss import huber_loss
 from nerf.training.frustum_mask import compute_frustum_mask
 from nerf.training.learning_rate import lr_multiplier
 from nerf.training.metrics import psnr
+from nerf.training.micro_batch import HashGridBatch, LossWeights, MicroBatch, joined
 from nerf.training.pixel_sampler import PixelSampler
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite, StepResult, all_finite
@@ -67,20 +68,6 @@ class HashGridTrainerSettings:
     min_photos: int = 1
 
 
-class HashGridBatch(NamedTuple):
-    """Rays with their target colours, which are composited over ``background``. ``jitter`` places the samples in their
-    intervals, ``thinning_offset`` decides which thin samples are kept (both in [0, 1)). ``view`` is the image of a ray,
-    ``known_depth`` the distance of what it meets, by a sparse point or a depth map; 0: that is not known."""
-
-    rays: Rays
-    target: Float[Tensor, "rays 3"]
-    background: Float[Tensor, "rays 3"]
-    jitter: Float[Tensor, "rays"]
-    thinning_offset: Float[Tensor, "rays"]
-    view: Int[Tensor, "rays"]
-    known_depth: Float[Tensor, "rays"]
-
-
 class Loss(NamedTuple):
     """A micro-batch's share of the loss and of its mean squared error, and the gradients of rendering, weights and
     colour effects' parameters."""
@@ -90,23 +77,6 @@ class Loss(NamedTuple):
     grad: Rendering
     grad_weights: Float[Tensor, "samples"]
     grad_effects: dict[str, Tensor]
-
-
-class MicroBatch(NamedTuple):
-    """What one micro-batch contributes: loss, gradients and their norm, the optical thickness of its samples, and the
-    number of density evaluations. ``batch`` is None of one that another process computed."""
-
-    batch: HashGridBatch | None
-    loss: Tensor
-    squared_error: Tensor
-    grad_networks: Weights
-    grad_features: Float[Tensor, "samples width"]
-    points: Float[Tensor, "samples 3"]
-    grad_background: dict[str, Tensor]
-    grad_effects: dict[str, Tensor]
-    grad_norm: Tensor
-    optical_thickness: Float[Tensor, "samples"]
-    density_evaluations: int
 
 
 @runtime_checkable
@@ -176,6 +146,9 @@ class HashGridTrainer:
 
     def step(self, step: int, progress: float, lr_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
+        return self._take_step(step, progress, lr_scale)[0]
+
+    def _take_step(self, step: int, progress: float, lr_scale: float) -> tuple[StepResult, Sequence[MicroBatch]]:
         device, count, rays = self.dataset.device, self.settings.micro_batches, self._rays_per_micro_batch()
         compute = partial(self._compute_micro_batch, step, progress, rays)
         if self.exchange is None:
@@ -183,15 +156,25 @@ class HashGridTrainer:
         else:
             micro_batches = self.exchange.all_micro_batches(step, compute, count)
         loss, error = self._check_finite(step, micro_batches)
+        self._finish_step(micro_batches, step, progress, lr_scale, rays * count)
+        colours = sum(int(each.colour_evaluations) for each in micro_batches)
+        densities = sum(int(each.density_evaluations) for each in micro_batches)
+        self._count_samples(colours, rays * count)
+        return StepResult(loss, psnr(error), rays * count, colours, densities), micro_batches
+
+    def _finish_step(
+        self, micro_batches: Sequence[MicroBatch], step: int, progress: float, lr_scale: float, rays: int
+    ) -> None:
+        """Learn from the micro-batches of a step of so many ``rays``."""
         self._update(micro_batches, lr_scale * lr_multiplier(step, progress), step + 1)
         with span("occupancy"):
-            self.occupancy_grid.update(step, generator(device, self.settings.seed, step, count))
-        colours = sum(len(each.points) for each in micro_batches)
-        densities = sum(each.density_evaluations for each in micro_batches)
-        rays *= count
+            random = generator(self.dataset.device, self.settings.seed, step, self.settings.micro_batches)
+            self.occupancy_grid.update(step, random)
         self.pixels_sampled += self._photo_ray_count(rays, progress)
+
+    def _count_samples(self, colours: int, rays: int) -> None:
+        """Of a step: the next ones draw rays accordingly."""
         self.samples_per_ray.mul_(SAMPLES_PER_RAY_EMA_DECAY).add_((1 - SAMPLES_PER_RAY_EMA_DECAY) * colours / rays)
-        return StepResult(loss, psnr(error), rays, colours, densities)
 
     def state(self) -> dict[str, Tensor]:
         """Weights and occupancy bits as ``model.<name>``, per-image parameters as ``image.<effect>.<name>``, Adam's
@@ -278,10 +261,30 @@ class HashGridTrainer:
             batch = self._batch(step, progress, index, rays)
             effect_rays = self.effects.forward_rays(batch.rays, batch.view)
             if not all_finite(effect_rays):
-                raise NonFinite(RAY_GEOMETRY, step, _joined([batch]))
-        forward_pass = self.model.forward(effect_rays, batch.jitter, batch.thinning_offset, batch.background)
+                raise NonFinite(RAY_GEOMETRY, step, joined([batch]))
+        rays *= self.settings.micro_batches
+        return self._differentiate(batch, effect_rays, rays, self._loss_weights(rays, progress))
+
+    def _loss_weights(self, rays: int, progress: float) -> LossWeights:
+        """In a step of so many rays."""
+
+        def per_ray(weight: float) -> Float[Tensor, ""]:
+            return torch.full((), weight / rays, device=self.dataset.device)
+
+        distortion = self.settings.distortion_weight * distortion_multiplier(progress)
+        depth = self.settings.depth_weight * depth_loss_multiplier(progress)
+        return LossWeights(
+            per_ray(distortion) if distortion else None, per_ray(depth) if self._has_depth_loss(progress) else None
+        )
+
+    def _differentiate(
+        self, batch: HashGridBatch, effect_rays: Rays, rays: int, weights: LossWeights, plan: SamplePlan | None = None
+    ) -> MicroBatch:
+        """What a batch adds to loss and gradients of a step of so many ``rays``; ``effect_rays``: its rays as ray
+        effects make them. With a ``plan`` nothing here waits for a GPU."""
+        forward_pass = self.model.forward(effect_rays, batch.jitter, batch.thinning_offset, batch.background, plan=plan)
         with span("composite"):
-            loss = self._loss(rays * self.settings.micro_batches, progress, forward_pass, batch)
+            loss = self._loss(rays, weights, forward_pass, batch)
         with span("backward", self._backward_work(forward_pass)):
             gradients = self.model.backward(forward_pass, loss.grad, loss.grad_weights)
             effects = loss.grad_effects | self.effects.backward_rays(
@@ -300,7 +303,10 @@ class HashGridTrainer:
             grad_effects=effects,
             grad_norm=torch.nn.utils.get_total_norm([*networks, features, *background.values(), *effects.values()]),
             optical_thickness=forward_pass.optical_thickness,
+            colour_evaluations=forward_pass.samples.starts[-1],
             density_evaluations=forward_pass.density_evaluations,
+            room=forward_pass.room,
+            fits=forward_pass.fits,
         )
 
     def _backward_work(self, forward_pass: HashGridPass) -> WorkCounts:
@@ -309,7 +315,7 @@ class HashGridTrainer:
         rows = CORNERS * len(self.model.layout.resolutions) * points if self.effects.rays else 0
         return WorkCounts(flops, rows)
 
-    def _loss(self, rays: int, progress: float, forward_pass: HashGridPass, batch: HashGridBatch) -> Loss:
+    def _loss(self, rays: int, weights: LossWeights, forward_pass: HashGridPass, batch: HashGridBatch) -> Loss:
         seen = RenderedRays(forward_pass.rendering, batch.background, batch.rays, batch.view)
         error = self.effects.residual(seen, batch.target)
         huber, half_gradient = huber_loss(error)
@@ -317,15 +323,13 @@ class HashGridTrainer:
         value, grad_weights = huber.sum() / (3 * rays), torch.zeros_like(forward_pass.weights)
         backend, stepping = self.model.backend, self.model.stepping
         mapped, samples = forward_pass.mapped, forward_pass.samples
-        if self.settings.distortion_weight:
-            per_ray = self.settings.distortion_weight * distortion_multiplier(progress) / rays
-            each = torch.full_like(batch.known_depth, per_ray)
+        if weights.distortion is not None:
+            each = weights.distortion.repeat(len(batch.known_depth))
             marched = samples._replace(dt=samples.dt / mapped.scene_length(samples.t, samples.ray))
             value = value + (each * backend.distortion(marched, forward_pass.weights, stepping)).sum()
             grad_weights = backend.distortion_backward(marched, forward_pass.weights, stepping, each)
-        if self._has_depth_loss(progress):
-            per_ray = self.settings.depth_weight * depth_loss_multiplier(progress) / rays
-            each = torch.full_like(batch.known_depth, per_ray)
+        if weights.depth is not None:
+            each = weights.depth.repeat(len(batch.known_depth))
             arguments = mapped.rays.far, mapped.from_scene(batch.known_depth), stepping
             depth_loss = backend.depth_loss(samples, forward_pass.weights, forward_pass.rendering.opacity, *arguments)
             value = value + (each * depth_loss).sum()
@@ -344,7 +348,7 @@ class HashGridTrainer:
         for quantity, value in {"loss": loss_now, "gradient": norm_now}.items():
             if not abs(value) < float("inf"):
                 own = [each.batch for each in micro_batches if each.batch is not None]
-                raise NonFinite(quantity, step, _joined(own))
+                raise NonFinite(quantity, step, joined(own))
         return loss_now, error_now
 
     def _update(self, micro_batches: Sequence[MicroBatch], factor: float, adam_step: int) -> None:
@@ -429,14 +433,6 @@ class HashGridTrainer:
         with span("occupancy"):
             for each in micro_batches:
                 self.occupancy_grid.raise_to(each.points, each.optical_thickness)
-
-
-def _joined(batches: Sequence[HashGridBatch]) -> dict[str, Tensor]:
-    """Micro-batches joined to one batch, by the names of its tensors."""
-    rays = zip(*(batch.rays for batch in batches), strict=True)
-    rest = zip(*(batch[1:] for batch in batches), strict=True)
-    names = (*Rays._fields, *HashGridBatch._fields[1:])
-    return {name: torch.cat(chunks) for name, chunks in zip(names, (*rays, *rest), strict=True)}
 
 
 def _shape(state: dict[str, Tensor], name: str) -> torch.Size | None:

@@ -5,9 +5,10 @@ equal steps. Densities are per scene unit, other than in the paper: so they do n
 begins thin before the cameras, where the cube is large and little is known.
 """
 
+import functools
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -62,7 +63,7 @@ class Ndc:
         x, y, z = mapped.unbind(-1)
         depth = 2 * self.near / (1 - z / self.half)
         sideways = (each * (slope / self.half) * depth for each, slope in zip((x, y), self.slopes, strict=True))
-        return torch.stack([*sideways, depth], -1) @ self._matrix(mapped) + mapped.new_tensor(self.apex)
+        return torch.stack([*sideways, depth], -1) @ self._matrix(mapped) + _constant(self.apex, mapped)
 
     def pull_back(
         self, points: Float[Tensor, "*points 3"], grad: Float[Tensor, "*points 3"]
@@ -79,7 +80,7 @@ class Ndc:
     def scene_length(self, mapped: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Length in the scene for a length in the cube along the line of sight from the apex, at mapped points within
         the open cube."""
-        points = self.inverse(mapped) - mapped.new_tensor(self.apex)
+        points = self.inverse(mapped) - _constant(self.apex, mapped)
         depth = 2 * self.near / (1 - mapped[..., 2] / self.half)
         return depth * points.norm(dim=-1) / (2 * self.half * self.near)
 
@@ -87,7 +88,7 @@ class Ndc:
         """Rays as straight lines through the cube, each from where it has passed the near plane, with distances of the
         cube. What is behind that plane for good has no length."""
         matrix = self._matrix(rays.origins)
-        origins, directions = (rays.origins - rays.origins.new_tensor(self.apex)) @ matrix.T, rays.directions @ matrix.T
+        origins, directions = (rays.origins - _constant(self.apex, rays.origins)) @ matrix.T, rays.directions @ matrix.T
         slope = directions[..., 2]
         with torch.no_grad():  # the interval says where to look, not what is seen
             # Where it passes the near plane, be it to the front or to the back; nowhere if it runs along it.
@@ -115,13 +116,24 @@ class Ndc:
         return torch.cat([sideways * self._scale(sideways) / depth[..., None], forward[..., None]], -1)
 
     def _scale(self, like: Tensor) -> Float[Tensor, "2"]:
-        return like.new_tensor([self.half / each for each in self.slopes])
+        return _constant(tuple(self.half / each for each in self.slopes), like)
 
     def _matrix(self, like: Tensor) -> Float[Tensor, "3 3"]:
-        return like.new_tensor(self.axes)
+        return _constant(self.axes, like)
 
     def _local(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-        return (points - points.new_tensor(self.apex)) @ self._matrix(points).T
+        return (points - _constant(self.apex, points)) @ self._matrix(points).T
+
+
+def _constant(values: tuple[Any, ...], like: Tensor) -> Tensor:
+    return _tensor(values, like.dtype, like.device)
+
+
+@functools.cache
+def _tensor(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Made once: to copy numbers to a GPU the host waits for it, which a CUDA graph may not."""
+    with torch.inference_mode(False):  # for whoever comes first may not need gradients
+        return torch.tensor(values, dtype=dtype, device=device)
 
 
 def enclosing_ndc(

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from nerf.fields.interface import Rendering
 from nerf.kernels import Samples
+from nerf.kernels.torch.packing import padded, padded_samples
 
 OPAQUE = 800.0
 MIN_KEEP_PROBABILITY = 1 / 16  # of a thin sample to be kept, so that no interval becomes more than 16 times as long
@@ -29,6 +30,7 @@ def visible_samples(
     threshold: float,
     thinning_threshold: float,
     thinning_offset: Float[Tensor, "rays"],
+    capacity: int | None = None,
 ) -> tuple[Samples, Int32[Tensor, "kept"]]:
     """The samples that are worth a colour, and their numbers among all.
 
@@ -46,12 +48,13 @@ def visible_samples(
     probability = _keep_probability(sigma * samples.dt, thinning_threshold)
     of_thin = torch.where(probability < 1, probability, 0).double()
     before = sums_before(samples, of_thin) + thinning_offset.double().index_select(0, samples.ray)
-    kept = ~(probability < 1) | ((before + of_thin).floor() > before.floor())
-    index = (kept & (_transmittances(samples, sigma).before >= threshold)).nonzero()[:, 0]
+    chosen = ~(probability < 1) | ((before + of_thin).floor() > before.floor())
+    index = (chosen & (_transmittances(samples, sigma).before >= threshold)).nonzero()[:, 0]
     starts = torch.searchsorted(index, samples.starts.long(), out_int32=True)
     index = index.int()
     ray, t, dt = (each.index_select(0, index) for each in (samples.ray, samples.t, samples.dt / probability))
-    return Samples(starts, ray, t, dt), index
+    kept = Samples(starts, ray, t, dt)
+    return (kept, index) if capacity is None else (padded_samples(kept, capacity), padded(index, capacity))
 
 
 def _keep_probability(tau: Float[Tensor, "samples"], thinning_threshold: float) -> Float[Tensor, "samples"]:

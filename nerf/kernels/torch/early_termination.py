@@ -9,6 +9,7 @@ from torch import Tensor
 from nerf.kernels import RayStepping, Samples
 from nerf.kernels.torch.compositing import OPAQUE
 from nerf.kernels.torch.marching import s_to_t, t_to_s
+from nerf.kernels.torch.packing import no_padding
 
 
 def finish_round(
@@ -49,6 +50,8 @@ def pack_rounds(rounds: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samp
         (first[number] - each.starts[:-1]).index_select(0, each.ray) + torch.arange(len(each.ray), device=ray.device)
         for number, each in enumerate(rounds)
     ]
-    order = torch.empty_like(ray)
-    order[torch.cat(places)] = torch.arange(len(ray), dtype=torch.int32, device=ray.device)
-    return Samples(starts, *(part.index_select(0, order) for part in (ray, t, dt))), order
+    chosen = torch.cat([no_padding(each) for each in rounds])
+    order = torch.zeros_like(ray)
+    order[torch.cat(places)[chosen]] = torch.arange(len(ray), dtype=torch.int32, device=ray.device)[chosen]
+    inside = torch.arange(len(ray), device=ray.device) < starts[-1]
+    return Samples(starts, *(torch.where(inside, part.index_select(0, order), 0) for part in (ray, t, dt))), order

@@ -9,9 +9,16 @@ from nerf.geometry.space_maps import Box
 from nerf.geometry.space_maps.contraction import Contraction, contract
 from nerf.kernels import BinaryOccupancy, RayStepping, Samples
 from nerf.kernels.torch.occupancy import cell_numbers, is_occupied
+from nerf.kernels.torch.packing import padded_samples
 
 
-def march(occupied: BinaryOccupancy, stepping: RayStepping, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples:
+def march(
+    occupied: BinaryOccupancy,
+    stepping: RayStepping,
+    rays: Rays,
+    jitter: Float[Tensor, "rays"],
+    capacity: int | None = None,
+) -> Samples:
     """The samples that lie in occupied cells.
 
     ``jitter`` in [0, 1) says where in its interval each sample of a ray stands; a sample that would stand at or
@@ -34,7 +41,8 @@ def march(occupied: BinaryOccupancy, stepping: RayStepping, rays: Rays, jitter: 
     ray, k_wanted = wanted.nonzero(as_tuple=True)
     start, end = (s_to_t(stepping, first[ray] + k_wanted + edge) for edge in (0, 1))
     dt = torch.minimum(end, rays.far[ray]) - start
-    return Samples(_starts_of(wanted.sum(-1)), ray.int(), t[wanted], dt)
+    samples = Samples(_starts_of(wanted.sum(-1)), ray.int(), t[wanted], dt)
+    return samples if capacity is None else padded_samples(samples, capacity)
 
 
 def s_to_t(stepping: RayStepping, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

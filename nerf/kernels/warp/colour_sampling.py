@@ -8,6 +8,7 @@ from torch import Tensor
 from nerf.kernels import ColourSamples, Samples
 from nerf.kernels.warp.compositing import opacity_of, optical_thickness
 from nerf.kernels.warp.launch import launch
+from nerf.kernels.warp.packing import new_packed
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,10 +28,7 @@ def select_colour_samples(
     launch(
         _select, rays, *packed, 1 / opacity_step, optical_depth, accumulated, counts, selected_index, selected_weights
     )
-    starts = counts.cumsum(0, dtype=torch.int32)
-    total = int(starts[-1])
-    index, ray = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
-    t, dt, weights = (torch.empty(total, device=device) for _ in range(3))
+    starts, (index, ray), (t, dt, weights) = new_packed(counts, 2, 3)
     selected = samples.starts, starts, samples.t, samples.dt, selected_index, selected_weights
     launch(_pack, rays, *selected, index, ray, t, dt, weights)
     return ColourSamples(Samples(starts, ray, t, dt), index, weights)

@@ -13,6 +13,7 @@ from nerf.fields.interface import Rendering
 from nerf.kernels import Samples
 from nerf.kernels.torch.compositing import MIN_KEEP_PROBABILITY, OPAQUE
 from nerf.kernels.warp.launch import launch
+from nerf.kernels.warp.packing import new_packed
 
 wp.set_module_options({"enable_backward": False})
 
@@ -26,6 +27,7 @@ def visible_samples(
     threshold: float,
     thinning_threshold: float,
     thinning_offset: Float[Tensor, "rays"],
+    capacity: int | None = None,
 ) -> tuple[Samples, Int32[Tensor, "kept"]]:
     """As in nerf.kernels.torch.compositing."""
     rays, device = len(samples.starts) - 1, sigma.device
@@ -33,10 +35,7 @@ def visible_samples(
     launch(
         _count_visible, rays, samples.starts, samples.dt, sigma, threshold, thinning_threshold, thinning_offset, counts
     )
-    starts = counts.cumsum(0, dtype=torch.int32)
-    total = int(starts[-1])
-    index, ray = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
-    t, dt = (torch.empty(total, device=device) for _ in range(2))
+    starts, (index, ray), (t, dt) = new_packed(counts, 2, 2, capacity)
     packed = samples.t, samples.dt, sigma
     launch(_keep_visible, rays, samples.starts, starts, *packed, thinning_threshold, thinning_offset, index, ray, t, dt)
     return Samples(starts, ray, t, dt), index
@@ -51,7 +50,7 @@ def composite(
 ) -> tuple[Rendering, Float[Tensor, "samples"]]:
     """As in nerf.kernels.torch.compositing."""
     rendering = Rendering(torch.empty_like(background), torch.empty_like(far), torch.empty_like(far))
-    weights = torch.empty_like(sigma)
+    weights = torch.zeros_like(sigma)
     packed = samples.starts, samples.t, samples.dt, sigma, colour
     launch(_composite, len(far), *packed, background, far, *rendering, weights)
     return rendering, weights
@@ -67,7 +66,7 @@ def composite_backward(
     grad_weights: Float[Tensor, "samples"],
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
     """As in nerf.kernels.torch.compositing."""
-    grad_sigma, grad_colour = torch.empty_like(sigma), torch.empty_like(colour)
+    grad_sigma, grad_colour = torch.zeros_like(sigma), torch.zeros_like(colour)
     packed = samples.starts, samples.t, samples.dt, sigma, colour
     arguments = *packed, background, far, *grad, grad_weights, grad_sigma, grad_colour
     launch(_composite_backward, len(far), *arguments)

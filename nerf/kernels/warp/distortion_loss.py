@@ -26,7 +26,7 @@ def distortion_backward(
     samples: Samples, weights: Float[Tensor, "samples"], stepping: RayStepping, grad: Float[Tensor, "rays"]
 ) -> Float[Tensor, "samples"]:
     """As in nerf.kernels.torch.distortion_loss."""
-    grad_weights = torch.empty_like(weights)
+    grad_weights = torch.zeros_like(weights)
     packed = samples.starts, samples.t, samples.dt, weights
     launch(_distortion_backward, len(grad), log_from(stepping), *packed, grad, grad_weights)
     return grad_weights

@@ -46,8 +46,8 @@ def pack_rounds(rounds: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samp
     """As in nerf.kernels.torch.early_termination."""
     starts, rays = sum(each.starts for each in rounds[1:]) + rounds[0].starts, len(rounds[0].starts) - 1
     total, device, before = sum(len(each.t) for each in rounds), starts.device, 0
-    order, ray = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
-    t, dt = (torch.empty(total, device=device) for _ in range(2))
+    order, ray = (torch.zeros(total, dtype=torch.int32, device=device) for _ in range(2))
+    t, dt = (torch.zeros(total, device=device) for _ in range(2))
     next_entry = starts[:-1].clone()
     for each in rounds:
         launch(_pack_round, rays, each.starts, each.t, each.dt, before, next_entry, order, ray, t, dt)

@@ -13,6 +13,7 @@ from nerf.geometry.space_maps import Box, Contraction
 from nerf.kernels import BinaryOccupancy, RayStepping, Samples
 from nerf.kernels.warp.launch import launch
 from nerf.kernels.warp.occupancy import cell_number
+from nerf.kernels.warp.packing import new_packed
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -21,10 +22,19 @@ _CONTRACTED_BOX = wp.constant(Contraction.half)
 _MAX_INVERSE = wp.constant(1.0e30)
 
 
-def march(occupied: BinaryOccupancy, stepping: RayStepping, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples:
+def march(
+    occupied: BinaryOccupancy,
+    stepping: RayStepping,
+    rays: Rays,
+    jitter: Float[Tensor, "rays"],
+    capacity: int | None = None,
+) -> Samples:
     """As in nerf.kernels.torch.marching."""
     count, device = len(jitter), jitter.device
-    sample_numbers = _scratch(count * stepping.max_samples, device)
+    length = count * stepping.max_samples
+    # A CUDA graph goes on using its memory; what is kept here may be replaced by a longer one.
+    kept = capacity is None
+    sample_numbers = _scratch(length, device) if kept else torch.empty(length, dtype=torch.int32, device=device)
     counts = torch.zeros(count + 1, dtype=torch.int32, device=device)
     first = torch.empty(count, device=device)
     far = torch.empty(count, device=device)
@@ -36,10 +46,7 @@ def march(occupied: BinaryOccupancy, stepping: RayStepping, rays: Rays, jitter: 
         stepping.max_samples,
     )
     launch(_march, count, *occupied, *sizes, *rays, jitter, sample_numbers, counts, first, far)
-    starts = counts.cumsum(0, dtype=torch.int32)
-    total = int(starts[-1])
-    ray = torch.empty(total, dtype=torch.int32, device=device)
-    t, dt = torch.empty(total, device=device), torch.empty(total, device=device)
+    starts, (ray,), (t, dt) = new_packed(counts, 1, 2, capacity)
     launch(_pack, count, *sizes[:2], stepping.max_samples, sample_numbers, starts, first, jitter, far, ray, t, dt)
     return Samples(starts, ray, t, dt)
 

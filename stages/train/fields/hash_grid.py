@@ -7,6 +7,7 @@ from nerf.effects import ImageEffects
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.mlp import HIDDEN
 from nerf.geometry.space_maps import Box, Contraction, Ndc, SpaceMap
+from nerf.training.graph_trainer import GraphTrainer
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from stages.contract import Progress
 from stages.effects.decisions import Space
@@ -215,7 +216,8 @@ def make_trainer(
     backend = load_backend(config.grid.backend, dataset.device.type)
     settings = field_settings(config, has_background_model(config, scene), space_map_of(config, scene))
     model = HashGridField(settings, seed, backend).to(dataset.device)
-    return HashGridTrainer(model, dataset, _trainer_settings(config, scene, seed), effects)
+    trainer = GraphTrainer if backend.CAPTURABLE and dataset.device.type == "cuda" else HashGridTrainer
+    return trainer(model, dataset, _trainer_settings(config, scene, seed), effects)
 
 
 def field_settings(config: Config, background_model: bool, space: SpaceMap | None = None) -> HashGridSettings:

@@ -14,12 +14,8 @@ from nerf.geometry.rays import Rays
 from nerf.geometry.space_maps.contraction import Contraction
 from nerf.kernels import torch as reference
 from nerf.training.evaluation_pixels import evaluate, sample_evaluation_pixels
-from nerf.training.hash_grid_trainer import (
-    HashGridBatch,
-    HashGridTrainer,
-    HashGridTrainerSettings,
-    depth_loss_multiplier,
-)
+from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings, depth_loss_multiplier
+from nerf.training.micro_batch import HashGridBatch
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from nerf.training.trainer import FieldTrainer, NonFinite
 
@@ -108,7 +104,7 @@ def test_a_batchs_gradient_is_the_sum_over_chunks() -> None:
         *(torch.cat(part) for part in zip(*(batch[1:] for batch in batches), strict=True)),
     )
     done = run.model.forward(whole.rays, whole.jitter, whole.thinning_offset, whole.background)
-    loss = run._loss(4 * rays, 0.25, done, whole)
+    loss = run._loss(4 * rays, run._loss_weights(4 * rays, 0.25), done, whole)
     gradients = run.model.backward(done, loss.grad, loss.grad_weights)
     summed = [torch.stack(of_parts).sum(0) for of_parts in zip(*(part.grad_networks for part in parts), strict=True)]
     torch.testing.assert_close(summed, list(gradients.weights), rtol=1e-4, atol=1e-9)
@@ -365,7 +361,8 @@ def test_the_depth_loss_fades_in_value_and_gradient() -> None:
     run.dataset = run.dataset.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
     batch = run._batch(0, 0.0, 0, 64)
     done = run.model.forward(batch.rays, batch.jitter, batch.thinning_offset, batch.background)
-    early, late, over = (run._loss(64, share, done, batch) for share in (0.25, 0.75, 1.0))
+    weights = (run._loss_weights(64, share) for share in (0.25, 0.75, 1.0))
+    early, late, over = (run._loss(64, each, done, batch) for each in weights)
     of_depth = [float(loss.value - over.value) for loss in (early, late)]
     assert of_depth[0] == pytest.approx(3 * of_depth[1]) and of_depth[1] > 0
     pulls = [loss.grad_weights - over.grad_weights for loss in (early, late)]

@@ -14,7 +14,8 @@ from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import Rendering
 from nerf.kernels import torch as reference
 from nerf.training.colour_loss import huber_loss
-from nerf.training.hash_grid_trainer import HashGridTrainer, MicroBatch
+from nerf.training.hash_grid_trainer import HashGridTrainer
+from nerf.training.micro_batch import MicroBatch
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite
 from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, same, small_dataset, trainer
@@ -32,7 +33,8 @@ def part_without_effects(run: HashGridTrainer, step: int, progress: float, rays:
     norm = torch.nn.utils.get_total_norm([*gradients.weights, gradients.features])
     losses = huber.sum() / (3 * rays), error.square().sum() / (3 * rays)
     learnt = gradients.weights, gradients.features, done.points, dict[str, Tensor](), dict[str, Tensor]()
-    return MicroBatch(batch, *losses, *learnt, norm, done.optical_thickness, done.density_evaluations)
+    counts = done.samples.starts[-1], done.density_evaluations
+    return MicroBatch(batch, *losses, *learnt, norm, done.optical_thickness, *counts, done.room, done.fits)
 
 
 def test_effects_that_are_off_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
