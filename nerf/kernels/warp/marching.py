@@ -45,9 +45,11 @@ def march(
         stepping.occupancy_resolution,
         stepping.max_samples,
     )
-    launch(_march, count, *occupied, *sizes, *rays, jitter, sample_numbers, counts, first, far)
+    # Neighbouring threads of a GPU, which have neighbouring rays, should touch neighbouring memory.
+    strides = (1, count) if jitter.is_cuda else (stepping.max_samples, 1)
+    launch(_march, count, *occupied, *sizes, *strides, *rays, jitter, sample_numbers, counts, first, far)
     starts, (ray,), (t, dt) = new_packed(counts, 1, 2, capacity)
-    launch(_pack, count, *sizes[:2], stepping.max_samples, sample_numbers, starts, first, jitter, far, ray, t, dt)
+    launch(_pack, count, *sizes[:2], *strides, sample_numbers, starts, first, jitter, far, ray, t, dt)
     return Samples(starts, ray, t, dt)
 
 
@@ -196,6 +198,8 @@ def _march(
     contracted: int,
     cells: int,
     max_samples: int,
+    ray_stride: int,
+    sample_stride: int,
     origins: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     nears: wp.array[float],
@@ -241,7 +245,7 @@ def _march(
             k += wp.max(1, int(wp.min(steps, 1.0e6)) + 1)
         else:
             if ((word >> wp.int64(number & 63)) & wp.int64(1)) != wp.int64(0):
-                sample_numbers[ray * max_samples + count] = k
+                sample_numbers[ray * ray_stride + count * sample_stride] = k
                 count += 1
             k += 1
     counts[ray + 1] = count
@@ -253,7 +257,8 @@ def _march(
 def _pack(
     step_size: float,
     cone_angle: float,
-    max_samples: int,
+    ray_stride: int,
+    sample_stride: int,
     sample_numbers: wp.array[int],
     starts: wp.array[int],
     s_near: wp.array[float],
@@ -266,7 +271,7 @@ def _pack(
     ray = wp.tid()
     start = starts[ray]
     for i in range(start, starts[ray + 1]):
-        k = float(sample_numbers[ray * max_samples + i - start])
+        k = float(sample_numbers[ray * ray_stride + (i - start) * sample_stride])
         start_t = s_to_t(step_size, cone_angle, s_near[ray] + k)
         end_t = wp.min(s_to_t(step_size, cone_angle, s_near[ray] + k + 1.0), far_ends[ray])
         rays[i] = ray
