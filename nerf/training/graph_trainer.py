@@ -156,7 +156,7 @@ class GraphTrainer(HashGridTrainer):
         def compute(batch: HashGridBatch, weights: LossWeights) -> tuple[MicroBatch, Float64[Tensor, "report"]]:
             effect_rays = self.effects.forward_rays(batch.rays, batch.view)
             found = self._differentiate(batch, effect_rays, rays, weights, plan)
-            geometry = torch.stack([each.isfinite().all() for each in effect_rays]).all()
+            geometry = torch.stack([each.sum() for each in effect_rays]).isfinite().all()
             usable = geometry & found.fits & (found.loss + found.grad_norm).isfinite()
             counts = found.colour_evaluations, found.density_evaluations
             numbers = found.loss, found.squared_error, found.grad_norm, geometry, found.fits, *counts
@@ -195,13 +195,15 @@ def with_spare_room(room: SamplePlan, max_samples: int) -> SamplePlan:
 
 
 def _only_if(usable: Bool[Tensor, ""], found: MicroBatch) -> MicroBatch:
-    """What a micro-batch contributes, or nothing."""
+    """What a micro-batch contributes, or nothing: then its points are zeros as well, for a gradient of zero at a point
+    that is not finite is none."""
 
     def kept(tensor: Tensor) -> Tensor:
         return torch.where(usable, tensor, 0)
 
     return found._replace(
         grad_networks=Weights(*map(kept, found.grad_networks)),
+        points=kept(found.points),
         grad_features=kept(found.grad_features),
         grad_background={name: kept(each) for name, each in found.grad_background.items()},
         grad_effects={name: kept(each) for name, each in found.grad_effects.items()},
