@@ -24,6 +24,7 @@ from torch.distributed.rendezvous import rendezvous
 
 from benchmarks.record import Record, add_out
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
+from nerf.fields.interface import RadianceModel
 from nerf.geometry.rays import Rays
 from nerf.geometry.space_maps.contraction import Contraction
 from nerf.kernels import warp
@@ -34,7 +35,7 @@ from nerf.training.graph_trainer import GraphTrainer
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from nerf.training.metrics import mean_squared_error, psnr
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.trainer import composite_over
+from nerf.training.trainer import FieldTrainer, composite_over
 
 DEVICE = torch.device("cuda")
 TARGET_SAMPLES, LEARNING_RATE = 1 << 18, 2e-2  # of a step on a GPU, as stages/train chooses them
@@ -54,7 +55,7 @@ def load(file: Path, photos: Path) -> tuple[dict[str, RayDataset], bool]:
     return datasets, facts["bounded"]
 
 
-def new_trainer(dataset: RayDataset, bounded: bool, target_samples: int, graph: bool = True) -> HashGridTrainer:
+def new_trainer(dataset: RayDataset, bounded: bool, target_samples: int) -> HashGridTrainer:
     """A fresh field and its trainer, with the sizes that stages/train gives a large budget on a GPU."""
     alpha = dataset.pixels.shape[1] == 4
     sizes: dict[str, Any] = {"num_levels": 8, "log2_hashmap_size": 20}
@@ -75,7 +76,7 @@ def new_trainer(dataset: RayDataset, bounded: bool, target_samples: int, graph: 
     how = HashGridTrainerSettings(
         0, "random" if alpha else (0.0, 0.0, 0.0), target_samples, learning_rate=LEARNING_RATE, **losses
     )
-    return (GraphTrainer if graph else HashGridTrainer)(field, dataset, how)
+    return HashGridTrainer(field, dataset, how)
 
 
 def joined() -> Ranks:
@@ -84,14 +85,14 @@ def joined() -> Ranks:
     return Ranks.join(store, rank, size, DEVICE)
 
 
-def train(trainer: HashGridTrainer | LeadingTrainer, seconds: float) -> dict[str, float]:
+def train(trainer: FieldTrainer, seconds: float) -> dict[str, float]:
     """Train for so many seconds; steps, and rays and colours a second."""
     for step in range(WARMUP_STEPS):
-        trainer.step(step, 0.0)
+        trainer.step(step, 0.0, 1.0)
     torch.cuda.synchronize()
     started, step, rays, colours, densities = time.perf_counter(), WARMUP_STEPS, 0, 0, 0
     while (elapsed := time.perf_counter() - started) < seconds:
-        done = trainer.step(step, elapsed / seconds)
+        done = trainer.step(step, elapsed / seconds, 1.0)
         step, rays = step + 1, rays + done.rays
         colours, densities = colours + done.colour_evaluations, densities + done.density_evaluations
     torch.cuda.synchronize()
@@ -105,7 +106,7 @@ def train(trainer: HashGridTrainer | LeadingTrainer, seconds: float) -> dict[str
     }
 
 
-def score(field: HashGridField, dataset: RayDataset) -> dict[str, float]:
+def score(field: RadianceModel, dataset: RayDataset) -> dict[str, float]:
     """Mean PSNR (dB) of the test photos, and the seconds that one takes."""
     white = torch.full((3,), float(dataset.pixels.shape[1] == 4), device=DEVICE)
 
@@ -127,12 +128,12 @@ def score(field: HashGridField, dataset: RayDataset) -> dict[str, float]:
     }
 
 
-def profile(trainer: HashGridTrainer | LeadingTrainer, test: RayDataset, step: int) -> None:
+def profile(trainer: FieldTrainer, test: RayDataset, step: int) -> None:
     """Print the kernels that take most of a step, and of a rendered photo, with the host's share of both."""
     activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
     one_photo = test._replace(first_pixel=test.first_pixel[:2], view_geometry=test.view_geometry[:, :1])
     for name, runs, run in (
-        ("step", PROFILED_STEPS, lambda: [trainer.step(step + each, 0.9) for each in range(PROFILED_STEPS)]),
+        ("step", PROFILED_STEPS, lambda: [trainer.step(step + each, 0.9, 1.0) for each in range(PROFILED_STEPS)]),
         ("frame", 1, lambda: score(trainer.model, one_photo)),
     ):
         with torch.profiler.profile(activities=activities) as seen:
@@ -155,9 +156,12 @@ def run(given: argparse.Namespace) -> None:
     torch.set_float32_matmul_precision(given.matmul)
     ranks = joined() if given.exchange else None
     for seconds in given.seconds:
-        trainer = new_trainer(datasets["train"], bounded, given.target_samples, given.graph)
+        trainer: FieldTrainer
+        trainer = new_trainer(datasets["train"], bounded, given.target_samples)
         if ranks is not None:
             trainer = LeadingTrainer(trainer, 0, ranks)
+        elif given.graph:
+            trainer = GraphTrainer(trainer)
         trained = train(trainer, seconds)
         record.add(
             set=given.file.stem,

@@ -28,8 +28,7 @@ from nerf.fields.mlp import Weights
 from nerf.runtime.parallel import in_order
 from nerf.runtime.profiler import span
 from nerf.runtime.ranks import Ranks, packed, packed_bytes, unpacker
-from nerf.training.hash_grid_trainer import HashGridTrainer
-from nerf.training.micro_batch import MicroBatch
+from nerf.training.hash_grid_trainer import HashGridTrainer, MicroBatch
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite, StepResult
 
 STEP, STATE, END = 0.0, 1.0, 2.0  # what rank 0 may ask for

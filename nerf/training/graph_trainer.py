@@ -18,15 +18,13 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from nerf.effects import NO_EFFECTS, ImageEffects
+from nerf.effects import ImageEffects
 from nerf.fields.hash_grid import HashGridField, SamplePlan
 from nerf.fields.mlp import Weights
 from nerf.rendering.early_termination import RoundSize
 from nerf.runtime.profiler import is_profiling
-from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
+from nerf.training.hash_grid_trainer import HashGridBatch, HashGridTrainer, LossWeights, MicroBatch, joined
 from nerf.training.metrics import psnr
-from nerf.training.micro_batch import HashGridBatch, LossWeights, MicroBatch, joined
-from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite, StepResult
 
 # A graph serves until the number of rays that steps should have is so far from its own; it has room for the samples of
@@ -75,7 +73,7 @@ class StepGraph:
         """The results for another batch."""
         given, own = ((*one.rays, *one[1:], *other) for one, other in ((batch, weights), (self.batch, self.weights)))
         for place, value in zip(own, given, strict=True):
-            if isinstance(place, Tensor):
+            if place is not None and value is not None:
                 place.copy_(value)
         self.graph.replay()
         return self.result
@@ -97,54 +95,60 @@ class _Report(NamedTuple):
         return cls(step, batch, numbers, ready)
 
 
-class GraphTrainer(HashGridTrainer):
-    """A :class:`HashGridTrainer` on a GPU, with a backend whose kernels a graph may hold. The result of a step is that
-    of the step before, and NonFinite comes one step late: what was not finite has changed nothing.
+class GraphTrainer:
+    """Steps of a hash-grid trainer on a GPU (:class:`nerf.training.trainer.FieldTrainer`), with a backend whose kernels
+    a graph may hold. The result of a step is that of the step before, and NonFinite comes one step late: what was not
+    finite has changed nothing.
 
-    Steps that several processes or micro-batches share, and those that are profiled, are taken as elsewhere."""
+    Steps of several micro-batches, and those that are profiled, are taken as the ``trainer`` takes them."""
 
-    def __init__(
-        self,
-        model: HashGridField,
-        dataset: RayDataset,
-        settings: HashGridTrainerSettings,
-        effects: ImageEffects = NO_EFFECTS,
-    ) -> None:
-        super().__init__(model, dataset, settings, effects)
+    def __init__(self, trainer: HashGridTrainer) -> None:
+        self.trainer = trainer
         self.graph: StepGraph | None = None
         self.has_room = True  # the graph, for the samples of the last step that is known
         self.unread: _Report | None = None
         self.last = StepResult(0.0, 0.0, 0, 0, 0)
 
+    @property
+    def model(self) -> HashGridField:
+        """The field in training."""
+        return self.trainer.model
+
+    @property
+    def effects(self) -> ImageEffects:
+        """The effects between the field and the images."""
+        return self.trainer.effects
+
     def step(self, step: int, progress: float, lr_scale: float = 1.0) -> StepResult:
         """One batch, one update."""
-        rays = self._rays_per_micro_batch()
-        alone = self.exchange is None and self.settings.micro_batches == 1 and not is_profiling()
-        if (
-            alone
-            and self.graph is not None
-            and self.has_room
-            and self.graph.suits(rays, self._has_depth_loss(progress))
-        ):
-            return self._step_by(self.graph, step, progress, lr_scale)
+        trainer = self.trainer
+        rays = trainer.rays_per_micro_batch()
+        single = trainer.settings.micro_batches == 1 and not is_profiling()
+        graph = self.graph if single and self.has_room else None
+        if graph is not None and graph.suits(rays, trainer.has_depth_loss(progress)):
+            return self._step_by(graph, step, progress, lr_scale)
         self._read()
         steady = abs(rays / max(1, self.last.rays) - 1) <= STEADY_CHANGE
-        self.last, (micro_batch, *_) = self._take_step(step, progress, lr_scale)
-        if alone and steady and micro_batch.batch is not None:
-            weights = self._loss_weights(rays, progress)
+        self.last, (micro_batch, *_) = trainer.take_step(step, progress, lr_scale)
+        if single and steady and micro_batch.batch is not None:
+            weights = trainer.loss_weights(rays, progress)
             self.graph, self.has_room = self._new_graph(micro_batch.room, micro_batch.batch, weights), True
         return self.last
 
+    def state(self) -> dict[str, Tensor]:
+        """The trainer's."""
+        return self.trainer.state()
+
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Restore what :meth:`state` gave."""
-        super().load_state(state)
+        self.trainer.load_state(state)
         self.unread = None
 
     def _step_by(self, graph: StepGraph, step: int, progress: float, lr_scale: float) -> StepResult:
-        batch = self._batch(step, progress, 0, graph.rays)
-        micro_batch, numbers = graph.launch(batch, self._loss_weights(graph.rays, progress))
+        batch = self.trainer.draw_batch(step, progress, 0, graph.rays)
+        micro_batch, numbers = graph.launch(batch, self.trainer.loss_weights(graph.rays, progress))
         report = _Report.of(step, batch, numbers)
-        self._finish_step([micro_batch], step, progress, lr_scale, graph.rays)
+        self.trainer.finish_step([micro_batch], step, progress, lr_scale, graph.rays)
         self._read()
         self.unread = report
         return self.last
@@ -155,7 +159,7 @@ class GraphTrainer(HashGridTrainer):
 
         def compute(batch: HashGridBatch, weights: LossWeights) -> tuple[MicroBatch, Float64[Tensor, "report"]]:
             effect_rays = self.effects.forward_rays(batch.rays, batch.view)
-            found = self._differentiate(batch, effect_rays, rays, weights, plan)
+            found = self.trainer.differentiate(batch, effect_rays, rays, weights, plan)
             geometry = torch.stack([each.sum() for each in effect_rays]).isfinite().all()
             usable = geometry & found.fits & (found.loss + found.grad_norm).isfinite()
             counts = found.colour_evaluations, found.density_evaluations
@@ -178,7 +182,7 @@ class GraphTrainer(HashGridTrainer):
         rays = len(report.batch.jitter)
         self.has_room = bool(fits)
         if fits:
-            self._count_samples(int(colours), rays)
+            self.trainer.count_samples(int(colours), rays)
         self.last = StepResult(loss, psnr(squared_error), rays, int(colours), int(densities))
 
 

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int32
 from torch import Tensor
 
 from nerf.effects import NO_EFFECTS, Effect, ImageEffects, RayGradients, RenderedRays, parameters_of
@@ -24,7 +24,6 @@ from nerf.training.colour_loss import huber_loss
 from nerf.training.frustum_mask import compute_frustum_mask
 from nerf.training.learning_rate import lr_multiplier
 from nerf.training.metrics import psnr
-from nerf.training.micro_batch import HashGridBatch, LossWeights, MicroBatch, joined
 from nerf.training.pixel_sampler import PixelSampler
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite, StepResult, all_finite
@@ -66,6 +65,48 @@ class HashGridTrainerSettings:
     distortion_weight: float = 0.0
     depth_weight: float = 0.0
     min_photos: int = 1
+
+
+class HashGridBatch(NamedTuple):
+    """Rays with their target colours, which are composited over ``background``. ``jitter`` places the samples in their
+    intervals, ``thinning_offset`` decides which thin samples are kept (both in [0, 1)). ``view`` is the image of a ray,
+    ``known_depth`` the distance of what it meets, by a sparse point or a depth map; 0: that is not known."""
+
+    rays: Rays
+    target: Float[Tensor, "rays 3"]
+    background: Float[Tensor, "rays 3"]
+    jitter: Float[Tensor, "rays"]
+    thinning_offset: Float[Tensor, "rays"]
+    view: Int[Tensor, "rays"]
+    known_depth: Float[Tensor, "rays"]
+
+
+class LossWeights(NamedTuple):
+    """What a ray's distortion loss and depth loss are multiplied by in the loss of a step; None: they are off."""
+
+    distortion: Float[Tensor, ""] | None
+    depth: Float[Tensor, ""] | None
+
+
+class MicroBatch(NamedTuple):
+    """What one micro-batch contributes: loss, gradients and their norm, the optical thickness of its samples, and the
+    numbers of colour and density evaluations. ``batch`` is None of one that another process computed. ``samples`` may
+    have padding at their end (nerf/kernels); ``room`` and ``fits`` are those of the HashGridPass."""
+
+    batch: HashGridBatch | None
+    loss: Tensor
+    squared_error: Tensor
+    grad_networks: Weights
+    grad_features: Float[Tensor, "samples width"]
+    points: Float[Tensor, "samples 3"]
+    grad_background: dict[str, Tensor]
+    grad_effects: dict[str, Tensor]
+    grad_norm: Tensor
+    optical_thickness: Float[Tensor, "samples"]
+    colour_evaluations: Int32[Tensor, ""]
+    density_evaluations: Int32[Tensor, ""]
+    room: SamplePlan
+    fits: Bool[Tensor, ""]
 
 
 class Loss(NamedTuple):
@@ -146,23 +187,23 @@ class HashGridTrainer:
 
     def step(self, step: int, progress: float, lr_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
-        return self._take_step(step, progress, lr_scale)[0]
+        return self.take_step(step, progress, lr_scale)[0]
 
-    def _take_step(self, step: int, progress: float, lr_scale: float) -> tuple[StepResult, Sequence[MicroBatch]]:
-        device, count, rays = self.dataset.device, self.settings.micro_batches, self._rays_per_micro_batch()
+    def take_step(self, step: int, progress: float, lr_scale: float) -> tuple[StepResult, Sequence[MicroBatch]]:
+        device, count, rays = self.dataset.device, self.settings.micro_batches, self.rays_per_micro_batch()
         compute = partial(self._compute_micro_batch, step, progress, rays)
         if self.exchange is None:
             micro_batches = list(in_order(compute, range(count), device))
         else:
             micro_batches = self.exchange.all_micro_batches(step, compute, count)
         loss, error = self._check_finite(step, micro_batches)
-        self._finish_step(micro_batches, step, progress, lr_scale, rays * count)
+        self.finish_step(micro_batches, step, progress, lr_scale, rays * count)
         colours = sum(int(each.colour_evaluations) for each in micro_batches)
         densities = sum(int(each.density_evaluations) for each in micro_batches)
-        self._count_samples(colours, rays * count)
+        self.count_samples(colours, rays * count)
         return StepResult(loss, psnr(error), rays * count, colours, densities), micro_batches
 
-    def _finish_step(
+    def finish_step(
         self, micro_batches: Sequence[MicroBatch], step: int, progress: float, lr_scale: float, rays: int
     ) -> None:
         """Learn from the micro-batches of a step of so many ``rays``."""
@@ -172,7 +213,7 @@ class HashGridTrainer:
             self.occupancy_grid.update(step, random)
         self.pixels_sampled += self._photo_ray_count(rays, progress)
 
-    def _count_samples(self, colours: int, rays: int) -> None:
+    def count_samples(self, colours: int, rays: int) -> None:
         """Of a step: the next ones draw rays accordingly."""
         self.samples_per_ray.mul_(SAMPLES_PER_RAY_EMA_DECAY).add_((1 - SAMPLES_PER_RAY_EMA_DECAY) * colours / rays)
 
@@ -202,11 +243,11 @@ class HashGridTrainer:
         for name, tensor in own.items():
             tensor.copy_(state[name])
 
-    def _rays_per_micro_batch(self) -> int:
+    def rays_per_micro_batch(self) -> int:
         rays = int(self.settings.target_samples / max(MIN_SAMPLES_PER_RAY, float(self.samples_per_ray)))
         return max(1, rays // self.settings.micro_batches)
 
-    def _batch(self, step: int, progress: float, index: int, count: int) -> HashGridBatch:
+    def draw_batch(self, step: int, progress: float, index: int, count: int) -> HashGridBatch:
         """The ``count`` rays of micro-batch number ``index``."""
         device = self.dataset.device
         random = generator(device, self.settings.seed, step, index)
@@ -218,7 +259,7 @@ class HashGridTrainer:
             sparse_pixels, known_depth[-sparse_count:] = self.dataset.sample_sparse_depths(sparse_count, random)
             pixel = torch.cat([pixel, sparse_pixels])
         rays, colour, alpha, view = self.dataset.lookup(pixel)
-        if self.dataset.depth_maps is not None and self._has_depth_loss(progress):
+        if self.dataset.depth_maps is not None and self.has_depth_loss(progress):
             of_maps = self._map_depths(pixel, rays, alpha, view)
             known_depth = torch.where(known_depth > 0, known_depth, of_maps)
         if self.settings.background == "random":
@@ -248,24 +289,24 @@ class HashGridTrainer:
 
     def _photo_ray_count(self, rays: int, progress: float) -> int:
         """How many of so many rays go through pixels of the sampler; the others go to sparse points."""
-        to_points = self.dataset.sparse_pixels is not None and self._has_depth_loss(progress)
+        to_points = self.dataset.sparse_pixels is not None and self.has_depth_loss(progress)
         return rays - rays // DEPTH_RAY_INTERVAL if to_points else rays
 
-    def _has_depth_loss(self, progress: float) -> bool:
+    def has_depth_loss(self, progress: float) -> bool:
         known = self.dataset.sparse_pixels is not None or self.dataset.depth_maps is not None
         return known and self.settings.depth_weight * depth_loss_multiplier(progress) > 0
 
     def _compute_micro_batch(self, step: int, progress: float, rays: int, index: int) -> MicroBatch:
         """What micro-batch number ``index``, of so many rays, adds to loss and gradients."""
         with span("batch"):
-            batch = self._batch(step, progress, index, rays)
+            batch = self.draw_batch(step, progress, index, rays)
             effect_rays = self.effects.forward_rays(batch.rays, batch.view)
             if not all_finite(effect_rays):
                 raise NonFinite(RAY_GEOMETRY, step, joined([batch]))
         rays *= self.settings.micro_batches
-        return self._differentiate(batch, effect_rays, rays, self._loss_weights(rays, progress))
+        return self.differentiate(batch, effect_rays, rays, self.loss_weights(rays, progress))
 
-    def _loss_weights(self, rays: int, progress: float) -> LossWeights:
+    def loss_weights(self, rays: int, progress: float) -> LossWeights:
         """In a step of so many rays."""
 
         def per_ray(weight: float) -> Float[Tensor, ""]:
@@ -274,10 +315,10 @@ class HashGridTrainer:
         distortion = self.settings.distortion_weight * distortion_multiplier(progress)
         depth = self.settings.depth_weight * depth_loss_multiplier(progress)
         return LossWeights(
-            per_ray(distortion) if distortion else None, per_ray(depth) if self._has_depth_loss(progress) else None
+            per_ray(distortion) if distortion else None, per_ray(depth) if self.has_depth_loss(progress) else None
         )
 
-    def _differentiate(
+    def differentiate(
         self, batch: HashGridBatch, effect_rays: Rays, rays: int, weights: LossWeights, plan: SamplePlan | None = None
     ) -> MicroBatch:
         """What a batch adds to loss and gradients of a step of so many ``rays``; ``effect_rays``: its rays as ray
@@ -376,7 +417,7 @@ class HashGridTrainer:
 
     def _background_prior(self, micro_batches: Sequence[MicroBatch]) -> dict[str, Tensor]:
         """The prior's gradient of the background where rays of this batch reach it; elsewhere it stays as it is."""
-        rays = len(micro_batches) * self._rays_per_micro_batch()
+        rays = len(micro_batches) * self.rays_per_micro_batch()
         touched = {
             name: torch.stack([each.grad_background[name] for each in micro_batches]).sum(0) != 0
             for name in self.background
@@ -433,6 +474,14 @@ class HashGridTrainer:
         with span("occupancy"):
             for each in micro_batches:
                 self.occupancy_grid.raise_to(each.points, each.optical_thickness)
+
+
+def joined(batches: Sequence[HashGridBatch]) -> dict[str, Tensor]:
+    """Micro-batches joined to one batch, by the names of its tensors."""
+    rays = zip(*(batch.rays for batch in batches), strict=True)
+    rest = zip(*(batch[1:] for batch in batches), strict=True)
+    names = (*Rays._fields, *HashGridBatch._fields[1:])
+    return {name: torch.cat(chunks) for name, chunks in zip(names, (*rays, *rest), strict=True)}
 
 
 def _shape(state: dict[str, Tensor], name: str) -> torch.Size | None:

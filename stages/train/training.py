@@ -16,6 +16,7 @@ from nerf.runtime.matmul_precision import use_matmul_precision
 from nerf.runtime.ranks import RankLost, Ranks
 from nerf.training.data_parallel import LeadingTrainer, end_others, follow_first_rank
 from nerf.training.evaluation_pixels import sample_evaluation_pixels
+from nerf.training.graph_trainer import GraphTrainer
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import FieldTrainer
@@ -185,6 +186,9 @@ def _trainers(config: Config, scene: Scene, inputs: Inputs, dataset: RayDataset)
 
 
 def _hash_grid(trainer: FieldTrainer) -> HashGridTrainer:
+    """The trainer whose steps ranks share."""
+    if isinstance(trainer, GraphTrainer):
+        return trainer.trainer
     assert isinstance(trainer, HashGridTrainer), "ranks_of() lets no other field pass"
     return trainer
 

@@ -77,10 +77,10 @@ def test_training_bits_are_the_same_on_any_threads(
     monkeypatch.setattr("nerf.fields.occupancy_grid.CHUNK_POINTS", 128)  # several chunks even here
     trainer, used = small_trainer(field), set[int]()
     guided = [
-        int((trainer._batch(0, 0.0, chunk, trainer._rays_per_micro_batch()).known_depth > 0).sum())
+        int((trainer.draw_batch(0, 0.0, chunk, trainer.rays_per_micro_batch()).known_depth > 0).sum())
         for chunk in range(4)
     ]
-    assert sum(guided) == 2 and trainer._rays_per_micro_batch() == 4
+    assert sum(guided) == 2 and trainer.rays_per_micro_batch() == 4
     forward = trainer.model.forward
     monkeypatch.setattr(trainer.model, "forward", lambda *chunk: used.add(threading.get_ident()) or forward(*chunk))
     start = copied(trainer.state())

@@ -16,7 +16,7 @@ from nerf.kernels.torch.marching import march, sample_points, sample_points_back
 from nerf.kernels.torch.occupancy import cell_corners, occupancy_bits, scatter_max
 from nerf.kernels.torch.spherical_harmonics import spherical_harmonics, spherical_harmonics_backward
 
-CAPTURABLE = False
+CAPTURABLE: bool = False
 
 __all__ = [
     "CAPTURABLE",

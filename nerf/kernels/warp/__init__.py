@@ -19,7 +19,7 @@ from nerf.kernels.warp.marching import march, sample_points, sample_points_backw
 from nerf.kernels.warp.occupancy import cell_corners, occupancy_bits, scatter_max
 from nerf.kernels.warp.spherical_harmonics import spherical_harmonics, spherical_harmonics_backward
 
-CAPTURABLE = True
+CAPTURABLE: bool = True
 
 __all__ = [
     "CAPTURABLE",

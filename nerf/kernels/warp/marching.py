@@ -36,8 +36,7 @@ def march(
     kept = capacity is None
     sample_numbers = _scratch(length, device) if kept else torch.empty(length, dtype=torch.int32, device=device)
     counts = torch.zeros(count + 1, dtype=torch.int32, device=device)
-    first = torch.empty(count, device=device)
-    far = torch.empty(count, device=device)
+    ends = torch.empty(count, 2, device=device)
     sizes = (
         stepping.step_size,
         stepping.cone_angle,
@@ -45,11 +44,10 @@ def march(
         stepping.occupancy_resolution,
         stepping.max_samples,
     )
-    # Neighbouring threads of a GPU, which have neighbouring rays, should touch neighbouring memory.
-    strides = (1, count) if jitter.is_cuda else (stepping.max_samples, 1)
-    launch(_march, count, *occupied, *sizes, *strides, *rays, jitter, sample_numbers, counts, first, far)
+    stride = 1 if jitter.is_cuda else stepping.max_samples
+    launch(_march, count, *occupied, *sizes, stride, *rays, jitter, sample_numbers, counts, ends)
     starts, (ray,), (t, dt) = new_packed(counts, 1, 2, capacity)
-    launch(_pack, count, *sizes[:2], *strides, sample_numbers, starts, first, jitter, far, ray, t, dt)
+    launch(_pack, count, *sizes[:2], stride, sample_numbers, starts, ends, jitter, ray, t, dt)
     return Samples(starts, ray, t, dt)
 
 
@@ -189,6 +187,13 @@ def _empty_span(contracted: int, cells: int, cell: wp.vec3i, empty: int, u: wp.v
     return wp.max(contracted_span, wp.min(exits))
 
 
+@wp.func
+def _place(ray: int, sample: int, stride: int, rays: int):
+    """Of a ray's sample in memory, where rays are ``stride`` apart: the samples of a ray follow each other, or those of
+    a GPU's neighbouring threads, which have neighbouring rays."""
+    return ray * stride + wp.where(stride == 1, sample * rays, sample)
+
+
 @wp.kernel
 def _march(
     bits: wp.array[wp.int64],
@@ -198,8 +203,7 @@ def _march(
     contracted: int,
     cells: int,
     max_samples: int,
-    ray_stride: int,
-    sample_stride: int,
+    stride: int,
     origins: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     nears: wp.array[float],
@@ -207,8 +211,7 @@ def _march(
     jitter: wp.array[float],
     sample_numbers: wp.array[int],
     counts: wp.array[int],
-    s_near: wp.array[float],
-    far_ends: wp.array[float],
+    ends: wp.array[wp.vec2],
 ):
     ray = wp.tid()
     o = origins[ray]
@@ -245,37 +248,36 @@ def _march(
             k += wp.max(1, int(wp.min(steps, 1.0e6)) + 1)
         else:
             if ((word >> wp.int64(number & 63)) & wp.int64(1)) != wp.int64(0):
-                sample_numbers[ray * ray_stride + count * sample_stride] = k
+                sample_numbers[_place(ray, count, stride, counts.shape[0] - 1)] = k
                 count += 1
             k += 1
     counts[ray + 1] = count
-    s_near[ray] = first
-    far_ends[ray] = far
+    ends[ray] = wp.vec2(first, far)
 
 
 @wp.kernel
 def _pack(
     step_size: float,
     cone_angle: float,
-    ray_stride: int,
-    sample_stride: int,
+    stride: int,
     sample_numbers: wp.array[int],
     starts: wp.array[int],
-    s_near: wp.array[float],
+    ends: wp.array[wp.vec2],
     jitter: wp.array[float],
-    far_ends: wp.array[float],
     rays: wp.array[int],
     distances: wp.array[float],
     lengths: wp.array[float],
 ):
     ray = wp.tid()
     start = starts[ray]
+    first = ends[ray][0]
+    far = ends[ray][1]
     for i in range(start, starts[ray + 1]):
-        k = float(sample_numbers[ray * ray_stride + (i - start) * sample_stride])
-        start_t = s_to_t(step_size, cone_angle, s_near[ray] + k)
-        end_t = wp.min(s_to_t(step_size, cone_angle, s_near[ray] + k + 1.0), far_ends[ray])
+        k = float(sample_numbers[_place(ray, i - start, stride, starts.shape[0] - 1)])
+        start_t = s_to_t(step_size, cone_angle, first + k)
+        end_t = wp.min(s_to_t(step_size, cone_angle, first + k + 1.0), far)
         rays[i] = ray
-        distances[i] = s_to_t(step_size, cone_angle, s_near[ray] + jitter[ray] + k)
+        distances[i] = s_to_t(step_size, cone_angle, first + jitter[ray] + k)
         lengths[i] = end_t - start_t
 
 

@@ -210,14 +210,14 @@ def step_in_words(config: Config) -> str:
 
 def make_trainer(
     config: Config, scene: "Scene", dataset: "RayDataset", seed: int, effects: ImageEffects
-) -> HashGridTrainer:
+) -> HashGridTrainer | GraphTrainer:
     """A fresh field with its trainer, where ``dataset`` is."""
     assert config.grid.backend, "plan() chooses it"
     backend = load_backend(config.grid.backend, dataset.device.type)
     settings = field_settings(config, has_background_model(config, scene), space_map_of(config, scene))
     model = HashGridField(settings, seed, backend).to(dataset.device)
-    trainer = GraphTrainer if backend.CAPTURABLE and dataset.device.type == "cuda" else HashGridTrainer
-    return trainer(model, dataset, _trainer_settings(config, scene, seed), effects)
+    trainer = HashGridTrainer(model, dataset, _trainer_settings(config, scene, seed), effects)
+    return GraphTrainer(trainer) if backend.CAPTURABLE and dataset.device.type == "cuda" else trainer
 
 
 def field_settings(config: Config, background_model: bool, space: SpaceMap | None = None) -> HashGridSettings:

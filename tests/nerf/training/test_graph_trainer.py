@@ -15,8 +15,7 @@ from nerf.kernels import Backend, warp
 from nerf.kernels import torch as reference
 from nerf.rendering.early_termination import RoundSize
 from nerf.training.graph_trainer import MIN_SPARE_ROOM, ROOM, GraphTrainer, with_spare_room
-from nerf.training.hash_grid_trainer import HashGridTrainer
-from nerf.training.micro_batch import MicroBatch
+from nerf.training.hash_grid_trainer import HashGridTrainer, MicroBatch
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite
 from tests.devices import skip_without
 from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, small_dataset
@@ -27,18 +26,18 @@ FORWARD = replace(FIELD, space=Ndc((0.0, 0.0, -3.0), AXES, (0.6, 0.6), 1.0), bac
 LOSSES = replace(TRAINER, distortion_weight=0.1, depth_weight=0.2)
 
 
-def trainer_on(device: str, backend: Backend, field: HashGridSettings = FIELD, graph: bool = True) -> HashGridTrainer:
+def trainer_on(device: str, backend: Backend, field: HashGridSettings = FIELD) -> HashGridTrainer:
     dataset = small_dataset().with_sparse_depths(torch.tensor([78, 222]), torch.tensor([3.0, 2.5])).to(device)
     model = HashGridField(field, 0, backend).to(device)
     centres = torch.tensor([[0.0, 0.0, -3.0], [0.0, 0.0, 3.0]], device=device)
     effects = ImageEffects((PoseRefinement(centres),), (ExposureModel(torch.zeros(2, 3, device=device)),))
-    return (GraphTrainer if graph else HashGridTrainer)(model, dataset, LOSSES, effects)
+    return HashGridTrainer(model, dataset, LOSSES, effects)
 
 
 def differentiated(run: HashGridTrainer, plan: SamplePlan | None = None) -> MicroBatch:
-    batch = run._batch(3, 0.25, 0, 64)
+    batch = run.draw_batch(3, 0.25, 0, 64)
     rays = run.effects.forward_rays(batch.rays, batch.view)
-    return run._differentiate(batch, rays, 64, run._loss_weights(64, 0.25), plan)
+    return run.differentiate(batch, rays, 64, run.loss_weights(64, 0.25), plan)
 
 
 @pytest.mark.parametrize("backend", [reference, warp], ids=["reference", "warp"])
@@ -46,7 +45,7 @@ def differentiated(run: HashGridTrainer, plan: SamplePlan | None = None) -> Micr
 def test_a_plan_with_room_changes_no_gradient(backend: Backend, field: HashGridSettings) -> None:
     run = trainer_on("cpu", backend, field)
     for step in range(20):
-        run._take_step(step, 0.1, 1.0)
+        run.take_step(step, 0.1, 1.0)
     exact = differentiated(run)
     plan = with_spare_room(exact.room, run.model.stepping.max_samples)
     padded = differentiated(run, plan)
@@ -84,19 +83,19 @@ def test_room_to_spare_stays_within_what_a_ray_may_have() -> None:
 @pytest.fixture
 def on_gpu() -> GraphTrainer:
     skip_without("cuda")
-    run = trainer_on("cuda", warp)
-    assert isinstance(run, GraphTrainer)
-    return run
+    return GraphTrainer(trainer_on("cuda", warp))
 
 
 @pytest.mark.gpu
 def test_a_graph_learns_what_single_launches_learn(on_gpu: GraphTrainer) -> None:
-    apart, graphs = trainer_on("cuda", warp, graph=False), set[int]()
-    for step in range(300):
-        of_graph, of_apart = on_gpu.step(step, step / 300), apart.step(step, step / 300)
+    apart, graphs = trainer_on("cuda", warp), set[int]()
+    for step in range(299):
+        on_gpu.step(step, step / 300)
+        apart.step(step, step / 300)
         graphs |= {id(on_gpu.graph)} - {id(None)}
     assert len(graphs) > 1, "graphs are made anew as the number of rays changes"
-    assert of_graph.psnr == pytest.approx(of_apart.psnr, abs=1.5) and of_apart.psnr > 25
+    of_graph, of_apart = on_gpu.step(299, 1.0), apart.step(299, 1.0)
+    assert min(of_graph.psnr, of_apart.psnr) > 40
     assert of_graph.colour_evaluations == pytest.approx(of_apart.colour_evaluations, rel=0.2)
     assert of_graph.rays == pytest.approx(of_apart.rays, rel=0.2)
 
@@ -107,16 +106,15 @@ def test_a_graph_refuses_what_is_not_finite_a_step_late(on_gpu: GraphTrainer) ->
         on_gpu.step(step, 0.5)
     assert on_gpu.graph is not None and on_gpu.unread is not None
     (poses,) = on_gpu.effects.rays
-    good = poses.parameters["turn"].clone()
-    before = {name: each for name, each in copied(on_gpu.state()).items() if name.startswith("model.t")}
+    good = copied(poses.parameters)
+    before = copied(on_gpu.state())["model.table"]
     poses.parameters["turn"][:, 1] = float("nan")
     on_gpu.step(200, 0.5)
     with pytest.raises(NonFinite, match=f"the {RAY_GEOMETRY} of step 200 is not finite"):
         on_gpu.step(201, 0.5)
-    assert before
-    for name, tensor in before.items():
-        torch.testing.assert_close(on_gpu.state()[name], tensor, rtol=0, atol=0)
-    poses.parameters["turn"].copy_(good)
+    assert torch.equal(on_gpu.state()["model.table"], before)
+    for name, tensor in poses.parameters.items():
+        tensor.copy_(good[name])
     for step in range(202, 205):
         on_gpu.step(step, 0.5)
 
@@ -127,7 +125,7 @@ def test_a_step_without_room_changes_nothing(on_gpu: GraphTrainer) -> None:
         on_gpu.step(step, 0.5)
     assert on_gpu.graph is not None
     batch, weights = on_gpu.graph.batch, on_gpu.graph.weights
-    (first, *_) = differentiated(on_gpu).room.rounds
+    (first, *_) = differentiated(on_gpu.trainer).room.rounds
     few = int((50 - MIN_SPARE_ROOM) / ROOM)  # with room to spare that is about 50
     on_gpu.graph = on_gpu._new_graph(SamplePlan((first._replace(capacity=few),), few), batch, weights)
     before = copied(on_gpu.state())["model.table"]

@@ -14,8 +14,12 @@ from nerf.geometry.rays import Rays
 from nerf.geometry.space_maps.contraction import Contraction
 from nerf.kernels import torch as reference
 from nerf.training.evaluation_pixels import evaluate, sample_evaluation_pixels
-from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings, depth_loss_multiplier
-from nerf.training.micro_batch import HashGridBatch
+from nerf.training.hash_grid_trainer import (
+    HashGridBatch,
+    HashGridTrainer,
+    HashGridTrainerSettings,
+    depth_loss_multiplier,
+)
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from nerf.training.trainer import FieldTrainer, NonFinite
 
@@ -94,7 +98,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 def test_a_batchs_gradient_is_the_sum_over_chunks() -> None:
     run = trainer(replace(TRAINER, target_samples=1 << 14, distortion_weight=0.1, depth_weight=0.2, micro_batches=4))
     run.dataset = run.dataset.with_sparse_depths(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
-    rays = run._rays_per_micro_batch()
+    rays = run.rays_per_micro_batch()
     parts = [run._compute_micro_batch(0, 0.25, rays, chunk) for chunk in range(4)]
     batches = [part.batch for part in parts if part.batch is not None]
     assert len(batches) == 4 and sum(int((batch.known_depth > 0).sum()) for batch in batches) == 4 * rays // 8
@@ -104,7 +108,7 @@ def test_a_batchs_gradient_is_the_sum_over_chunks() -> None:
         *(torch.cat(part) for part in zip(*(batch[1:] for batch in batches), strict=True)),
     )
     done = run.model.forward(whole.rays, whole.jitter, whole.thinning_offset, whole.background)
-    loss = run._loss(4 * rays, run._loss_weights(4 * rays, 0.25), done, whole)
+    loss = run._loss(4 * rays, run.loss_weights(4 * rays, 0.25), done, whole)
     gradients = run.model.backward(done, loss.grad, loss.grad_weights)
     summed = [torch.stack(of_parts).sum(0) for of_parts in zip(*(part.grad_networks for part in parts), strict=True)]
     torch.testing.assert_close(summed, list(gradients.weights), rtol=1e-4, atol=1e-9)
@@ -359,9 +363,9 @@ def test_points_guide_a_run_less_and_less() -> None:
 def test_the_depth_loss_fades_in_value_and_gradient() -> None:
     run = trainer(replace(TRAINER, depth_weight=0.1))
     run.dataset = run.dataset.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
-    batch = run._batch(0, 0.0, 0, 64)
+    batch = run.draw_batch(0, 0.0, 0, 64)
     done = run.model.forward(batch.rays, batch.jitter, batch.thinning_offset, batch.background)
-    weights = (run._loss_weights(64, share) for share in (0.25, 0.75, 1.0))
+    weights = (run.loss_weights(64, share) for share in (0.25, 0.75, 1.0))
     early, late, over = (run._loss(64, each, done, batch) for each in weights)
     of_depth = [float(loss.value - over.value) for loss in (early, late)]
     assert of_depth[0] == pytest.approx(3 * of_depth[1]) and of_depth[1] > 0
@@ -376,18 +380,18 @@ def test_an_eighth_of_the_rays_run_to_points() -> None:
     run = trainer(replace(TRAINER, depth_weight=0.1))
     run.dataset = run.dataset.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
     for count in (1, 3, 5, 8, 21):
-        to_points = [int((run._batch(0, 0.1, chunk, count).known_depth > 0).sum()) for chunk in range(32)]
+        to_points = [int((run.draw_batch(0, 0.1, chunk, count).known_depth > 0).sum()) for chunk in range(32)]
         assert sum(to_points) == 32 * count // 8 and max(to_points) - min(to_points) <= 1
 
 
 def test_depth_maps_supervise_opaque_pixels_in_the_box() -> None:
     run = trainer(replace(TRAINER, depth_weight=0.1))
     run.dataset = run.dataset.with_depth_maps([torch.full((3, 3), 2.5), torch.full((12, 12), 4.9)])
-    batch = run._batch(0, 0.1, 0, 288)
+    batch = run.draw_batch(0, 0.1, 0, 288)
     _, _, alpha, view = run.dataset.lookup(run.dataset.unmasked_pixels(run.pixel_sampler.take(0, 288)))
     assert alpha is not None and 0 < (alpha == 1).float().mean() < 1
     assert torch.equal(batch.known_depth, torch.where((alpha == 1) & (view == 0), 2.5, 0.0)), "4.9 ends behind the box"
-    assert not run._batch(0, 1.0, 0, 288).known_depth.any(), "at the end photos alone decide"
+    assert not run.draw_batch(0, 1.0, 0, 288).known_depth.any(), "at the end photos alone decide"
 
 
 def test_depth_maps_pull_density_to_where_they_are() -> None:

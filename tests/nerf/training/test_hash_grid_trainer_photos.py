@@ -14,8 +14,7 @@ from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import Rendering
 from nerf.kernels import torch as reference
 from nerf.training.colour_loss import huber_loss
-from nerf.training.hash_grid_trainer import HashGridTrainer
-from nerf.training.micro_batch import MicroBatch
+from nerf.training.hash_grid_trainer import HashGridTrainer, MicroBatch
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite
 from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, same, small_dataset, trainer
@@ -23,7 +22,7 @@ from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, s
 
 def part_without_effects(run: HashGridTrainer, step: int, progress: float, rays: int, chunk: int) -> MicroBatch:
     """What a chunk adds to loss and gradients, written as if there were no effects."""
-    batch = run._batch(step, progress, chunk, rays)
+    batch = run.draw_batch(step, progress, chunk, rays)
     done = run.model.forward(batch.rays, batch.jitter, batch.thinning_offset, batch.background)
     error = done.rendering.colour - batch.target
     huber, half_gradient = huber_loss(error)
