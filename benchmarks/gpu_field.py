@@ -167,6 +167,7 @@ def run(given: argparse.Namespace) -> None:
             set=given.file.stem,
             train_seconds=seconds,
             matmul=given.matmul,
+            refused=trainer.refused if isinstance(trainer, GraphTrainer) else None,
             graph=given.graph and not given.exchange,
             exchange="" if ranks is None else ranks.backend,
             **score(trainer.model, datasets["test"]),

@@ -129,24 +129,24 @@ class HashGridSettings:
         )
 
 
-class SamplePlan(NamedTuple):
-    """For how many samples there is room: in each round of marching, and among the visible ones. With a plan the host
-    need not wait for a GPU to count them."""
+class SampleCapacities(NamedTuple):
+    """Of each round of marching, and of the visible samples (a ``capacity`` of nerf/kernels): given these, the host
+    need not wait for a GPU to count samples."""
 
     rounds: tuple[RoundSize, ...]
     visible: int
 
 
 class HashGridPass(NamedTuple):
-    """What a rendering computed on its way, for :meth:`HashGridField.backward`. ``room`` is the plan it was given, or
-    one that has just room for its samples. ``density_evaluations``: how many points the density was evaluated at.
-    ``fits``: whether there was room for all samples. ``optical_thickness`` is that of the samples' own intervals,
-    before thinning. ``samples`` stand at distances along the ``mapped`` rays, for lengths in the scene."""
+    """What a rendering computed on its way, for :meth:`HashGridField.backward`. ``capacities`` are those that it was
+    given, or just needed; ``fits``: whether they sufficed. ``density_evaluations``: how many points the density was
+    evaluated at. ``optical_thickness`` is that of the samples' own intervals, before thinning. ``samples`` stand at
+    distances along the ``mapped`` rays, for lengths in the scene."""
 
     rays: Rays
     mapped: MappedRays
     background: Float[Tensor, "rays 3"]
-    room: SamplePlan
+    capacities: SampleCapacities
     density_evaluations: Int32[Tensor, ""]
     fits: Bool[Tensor, ""]
     samples: Samples
@@ -287,14 +287,14 @@ class HashGridField(nn.Module):
         jitter: Float[Tensor, "rays"],
         thinning_offset: Float[Tensor, "rays"],
         background: Float[Tensor, "rays 3"],
-        plan: SamplePlan | None = None,
+        capacities: SampleCapacities | None = None,
     ) -> HashGridPass:
         """Density of all samples in occupied cells; colour of the visible ones, thinned by ``thinning_offset``
-        (``Backend.visible_samples``). With a ``plan`` arrays of samples have its lengths, with padding at their end
-        (nerf/kernels)."""
+        (``Backend.visible_samples``). With ``capacities`` arrays of samples have these lengths, with padding at their
+        end (nerf/kernels)."""
         backend, rays = self.backend, rays.each(Tensor.contiguous)
         background, mapped = self._background_of(rays, background), self.space.map_rays(rays)
-        rounds = list(self._march(mapped, jitter, self.stepping, plan and plan.rounds))
+        rounds = list(self._march(mapped, jitter, self.stepping, capacities and capacities.rounds))
         with span("march"):
             marched, order = backend.pack_rounds([each.samples for each in rounds])
             sigma = torch.cat([each.density.sigma for each in rounds]).index_select(0, order)
@@ -304,7 +304,7 @@ class HashGridField(nn.Module):
                 EARLY_STOP_TRANSMITTANCE,
                 THINNING_THRESHOLD,
                 thinning_offset,
-                capacity=plan and plan.visible,
+                capacity=capacities and capacities.visible,
             )
             rows = order.index_select(0, seen)
             points = torch.cat([each.points for each in rounds]).index_select(0, rows)
@@ -321,11 +321,11 @@ class HashGridField(nn.Module):
         with span("composite"):
             of_scene = _in_scene(mapped, samples)
             rendering, weights = backend.composite(of_scene, density.sigma, colour.colour, background, rays.far)
-        room = SamplePlan(tuple(RoundSize(each.per_ray, len(each.points)) for each in rounds), len(points))
-        fits = jitter.new_ones((), dtype=torch.bool) if plan is None else self._fits(rounds, samples)
+        needed = SampleCapacities(tuple(RoundSize(each.per_ray, len(each.points)) for each in rounds), len(points))
+        fits = jitter.new_ones((), dtype=torch.bool) if capacities is None else self._fits(rounds, samples)
         of_samples = samples, points, optical_thickness, density
-        of_plan = room, marched.starts[-1], fits
-        return HashGridPass(rays, mapped, background, *of_plan, *of_samples, harmonics, colour, rendering, weights)
+        counted = needed, marched.starts[-1], fits
+        return HashGridPass(rays, mapped, background, *counted, *of_samples, harmonics, colour, rendering, weights)
 
     def _fits(self, rounds: Sequence[MarchingRound], visible: Samples) -> Bool[Tensor, ""]:
         """Whether no array of samples is full, and no ray goes on behind the last round."""

@@ -146,7 +146,7 @@ class RankExchange:
             grad_features=like.grad_features[:0] if self.is_dense else of_samples(like.grad_features),
             colour_evaluations=torch.tensor(sizes.samples, dtype=torch.int32),
             density_evaluations=torch.tensor(sizes.density_evaluations, dtype=torch.int32),
-            room=like.room,
+            capacities=like.capacities,
             fits=like.fits,
         )
 

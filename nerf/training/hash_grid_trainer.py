@@ -12,7 +12,7 @@ from torch import Tensor
 from nerf.effects import NO_EFFECTS, Effect, ImageEffects, RayGradients, RenderedRays, parameters_of
 from nerf.fields import mlp
 from nerf.fields.background import BACKGROUND_LR_SCALE, BACKGROUND_PRIOR
-from nerf.fields.hash_grid import CORNERS, HashGridField, HashGridPass, SamplePlan
+from nerf.fields.hash_grid import CORNERS, HashGridField, HashGridPass, SampleCapacities
 from nerf.fields.interface import Rendering
 from nerf.fields.mlp import Weights
 from nerf.fields.occupancy_grid import OccupancyGrid
@@ -90,8 +90,9 @@ class LossWeights(NamedTuple):
 
 class MicroBatch(NamedTuple):
     """What one micro-batch contributes: loss, gradients and their norm, the optical thickness of its samples, and the
-    numbers of colour and density evaluations. ``batch`` is None of one that another process computed. ``samples`` may
-    have padding at their end (nerf/kernels); ``room`` and ``fits`` are those of the HashGridPass."""
+    numbers of colour and density evaluations. ``batch`` is None of one that another process computed. Points, their
+    gradients and optical thickness may have padding at their end (nerf/kernels); ``capacities`` and ``fits`` are those
+    of the HashGridPass."""
 
     batch: HashGridBatch | None
     loss: Tensor
@@ -105,7 +106,7 @@ class MicroBatch(NamedTuple):
     optical_thickness: Float[Tensor, "samples"]
     colour_evaluations: Int32[Tensor, ""]
     density_evaluations: Int32[Tensor, ""]
-    room: SamplePlan
+    capacities: SampleCapacities
     fits: Bool[Tensor, ""]
 
 
@@ -190,16 +191,15 @@ class HashGridTrainer:
         return self.take_step(step, progress, lr_scale)[0]
 
     def take_step(self, step: int, progress: float, lr_scale: float) -> tuple[StepResult, Sequence[MicroBatch]]:
+        """:meth:`step`, and what its micro-batches were."""
         device, count, rays = self.dataset.device, self.settings.micro_batches, self.rays_per_micro_batch()
         compute = partial(self._compute_micro_batch, step, progress, rays)
         if self.exchange is None:
             micro_batches = list(in_order(compute, range(count), device))
         else:
             micro_batches = self.exchange.all_micro_batches(step, compute, count)
-        loss, error = self._check_finite(step, micro_batches)
+        loss, error, colours, densities = self._check_finite(step, micro_batches)
         self.finish_step(micro_batches, step, progress, lr_scale, rays * count)
-        colours = sum(int(each.colour_evaluations) for each in micro_batches)
-        densities = sum(int(each.density_evaluations) for each in micro_batches)
         self.count_samples(colours, rays * count)
         return StepResult(loss, psnr(error), rays * count, colours, densities), micro_batches
 
@@ -207,7 +207,7 @@ class HashGridTrainer:
         self, micro_batches: Sequence[MicroBatch], step: int, progress: float, lr_scale: float, rays: int
     ) -> None:
         """Learn from the micro-batches of a step of so many ``rays``."""
-        self._update(micro_batches, lr_scale * lr_multiplier(step, progress), step + 1)
+        self._update(micro_batches, lr_scale * lr_multiplier(step, progress), step + 1, rays)
         with span("occupancy"):
             random = generator(self.dataset.device, self.settings.seed, step, self.settings.micro_batches)
             self.occupancy_grid.update(step, random)
@@ -244,6 +244,7 @@ class HashGridTrainer:
             tensor.copy_(state[name])
 
     def rays_per_micro_batch(self) -> int:
+        """As many as have the colours that a step should compute, by the last steps."""
         rays = int(self.settings.target_samples / max(MIN_SAMPLES_PER_RAY, float(self.samples_per_ray)))
         return max(1, rays // self.settings.micro_batches)
 
@@ -293,6 +294,7 @@ class HashGridTrainer:
         return rays - rays // DEPTH_RAY_INTERVAL if to_points else rays
 
     def has_depth_loss(self, progress: float) -> bool:
+        """Whether some distances are known, and still count."""
         known = self.dataset.sparse_pixels is not None or self.dataset.depth_maps is not None
         return known and self.settings.depth_weight * depth_loss_multiplier(progress) > 0
 
@@ -319,11 +321,18 @@ class HashGridTrainer:
         )
 
     def differentiate(
-        self, batch: HashGridBatch, effect_rays: Rays, rays: int, weights: LossWeights, plan: SamplePlan | None = None
+        self,
+        batch: HashGridBatch,
+        effect_rays: Rays,
+        rays: int,
+        weights: LossWeights,
+        capacities: SampleCapacities | None = None,
     ) -> MicroBatch:
         """What a batch adds to loss and gradients of a step of so many ``rays``; ``effect_rays``: its rays as ray
-        effects make them. With a ``plan`` nothing here waits for a GPU."""
-        forward_pass = self.model.forward(effect_rays, batch.jitter, batch.thinning_offset, batch.background, plan=plan)
+        effects make them. With ``capacities`` nothing here waits for a GPU."""
+        forward_pass = self.model.forward(
+            effect_rays, batch.jitter, batch.thinning_offset, batch.background, capacities=capacities
+        )
         with span("composite"):
             loss = self._loss(rays, weights, forward_pass, batch)
         with span("backward", self._backward_work(forward_pass)):
@@ -346,7 +355,7 @@ class HashGridTrainer:
             optical_thickness=forward_pass.optical_thickness,
             colour_evaluations=forward_pass.samples.starts[-1],
             density_evaluations=forward_pass.density_evaluations,
-            room=forward_pass.room,
+            capacities=forward_pass.capacities,
             fits=forward_pass.fits,
         )
 
@@ -378,21 +387,24 @@ class HashGridTrainer:
             grad_weights, grad = grad_weights + more_weights, grad._replace(opacity=grad.opacity + more_opacity)
         return Loss(value, error.square().sum() / (3 * rays), grad, grad_weights, effects)
 
-    def _check_finite(self, step: int, micro_batches: Sequence[MicroBatch]) -> tuple[float, float]:
-        """Loss and squared error as numbers. Raises NonFinite unless they and all gradients are finite.
+    def _check_finite(self, step: int, micro_batches: Sequence[MicroBatch]) -> tuple[float, float, int, int]:
+        """Loss, squared error, colour and density evaluations as numbers. Raises NonFinite unless all gradients and the
+        first two are finite.
 
         The table's gradient is a sum of the features' gradients with weights up to 1: finite if their norm is.
         """
         each = zip(*((one.loss, one.squared_error, one.grad_norm) for one in micro_batches), strict=True)
-        # One wait for the GPU, not three.
-        loss_now, error_now, norm_now = torch.stack([torch.stack(values).sum() for values in each]).tolist()
+        counts = zip(*((one.colour_evaluations, one.density_evaluations) for one in micro_batches), strict=True)
+        # One wait for the GPU, not five.
+        sums = [torch.stack(values).sum().double() for values in (*each, *counts)]
+        loss_now, error_now, norm_now, colours, densities = torch.stack(sums).tolist()
         for quantity, value in {"loss": loss_now, "gradient": norm_now}.items():
             if not abs(value) < float("inf"):
                 own = [each.batch for each in micro_batches if each.batch is not None]
                 raise NonFinite(quantity, step, joined(own))
-        return loss_now, error_now
+        return loss_now, error_now, int(colours), int(densities)
 
-    def _update(self, micro_batches: Sequence[MicroBatch], factor: float, adam_step: int) -> None:
+    def _update(self, micro_batches: Sequence[MicroBatch], factor: float, adam_step: int, rays: int) -> None:
         """Update the table's levels, which share no rows, the networks, the per-image parameters and the occupancy
         grid, each on a core; on a GPU all levels at once. ``factor`` scales all learning rates."""
         levels = range(len(self.model.layout.resolutions))
@@ -406,7 +418,7 @@ class HashGridTrainer:
         work = [partial(self._update_levels, some, unscattered, learning_rate, adam_step) for some in together]
         networks = [each.grad_networks._asdict() for each in micro_batches]
         work.append(partial(self._update_small, Weights._fields, networks, learning_rate, adam_step))
-        background = [*(each.grad_background for each in micro_batches), self._background_prior(micro_batches)]
+        background = [*(each.grad_background for each in micro_batches), self._background_prior(micro_batches, rays)]
         background_lr = BACKGROUND_LR_SCALE * learning_rate
         work.append(partial(self._update_small, self.background, background, background_lr, adam_step))
         work.append(partial(self._raise_occupancy, micro_batches))
@@ -415,9 +427,8 @@ class HashGridTrainer:
         for _ in in_order(lambda update: update(), work, self.dataset.device):
             pass
 
-    def _background_prior(self, micro_batches: Sequence[MicroBatch]) -> dict[str, Tensor]:
+    def _background_prior(self, micro_batches: Sequence[MicroBatch], rays: int) -> dict[str, Tensor]:
         """The prior's gradient of the background where rays of this batch reach it; elsewhere it stays as it is."""
-        rays = len(micro_batches) * self.rays_per_micro_batch()
         touched = {
             name: torch.stack([each.grad_background[name] for each in micro_batches]).sum(0) != 0
             for name in self.background

@@ -7,7 +7,7 @@ number, so a run that resumes from a saved state repeats exactly what it would h
 from typing import NamedTuple, Protocol
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf.effects import ImageEffects
@@ -40,7 +40,8 @@ class FieldTrainer(Protocol):
         ...
 
     def step(self, step: int, progress: float, lr_scale: float) -> StepResult:
-        """Take step number ``step``, ``progress`` of the run being done. Raises NonFinite and changes nothing."""
+        """Take step number ``step``, ``progress`` of the run being done. Raises NonFinite and changes nothing. Where
+        that would make a GPU wait, it does so one step late, and results are those of the step before."""
         ...
 
     def state(self) -> dict[str, Tensor]:
@@ -63,10 +64,10 @@ class NonFinite(Exception):
 RAY_GEOMETRY = "geometry of rays"
 
 
-def all_finite(rays: Rays) -> bool:
+def all_finite(rays: Rays) -> Bool[Tensor, ""]:
     """Whether all rays are finite. NaN would drop out of the comparisons that clip a ray to the box, and the ray would
     count as empty."""
-    return bool(torch.cat([each.flatten() for each in rays]).isfinite().all())
+    return torch.cat([each.flatten() for each in rays]).isfinite().all()
 
 
 def composite_over(

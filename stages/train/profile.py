@@ -1,7 +1,8 @@
 """Where the time of a training run goes, span by span, and how near that is to what this machine can do.
 
-One step in PROFILE_INTERVAL is profiled (nerf/runtime/profiler.py): the same kernels in the same order, so the result
-does not depend on it. At the end the machine's own rates are measured and compared with the work of each span.
+One step in PROFILE_INTERVAL is profiled (nerf/runtime/profiler.py): the same kernels in the same order, so on a CPU the
+result does not depend on it; on a GPU they are launched one by one for it, with more time between them. At the end the
+machine's own rates are measured and compared with the work of each span.
 """
 
 import time
@@ -31,7 +32,9 @@ def profiled_step(
     """Take a step. Profile it if it is due, and add its profile to ``timings``: JSON values, empty at first."""
     if step % PROFILE_INTERVAL != FIRST_PROFILED_STEP:
         return take()
-    profiler, started = Profiler(device), time.perf_counter()
+    profiler = Profiler(device)
+    profiler.now()  # a GPU may still be busy with the step before
+    started = time.perf_counter()
     with profiling(profiler):
         result = take()
     seconds = time.perf_counter() - started

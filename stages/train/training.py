@@ -55,6 +55,11 @@ from stages.train.validation_images import (
     with_validation_split,
 )
 
+LACKS_MEMORY = (
+    "the GPU's memory has no place for CUDA graphs of the steps, which make them up to twice as fast; try a smaller "
+    "--train.grid.target-samples"
+)
+
 
 class Training(NamedTuple):
     """A run that is ready for its next step. ``earlier_seconds``: wall time of the trainings that it continues;
@@ -250,11 +255,14 @@ def _closing_notes(training: Training) -> list[str]:
     gain = predicted_gain(config.kind, training.run.schedule.is_single_cycle, state.curve)
     doubling = doubling_message(state.curve, gain)
     target = target_message(state.pending_target(config.target_psnr), state.validation_psnr, state.seconds)
-    return [message for message in (doubling, target) if message]
+    trainer = training.run.trainer
+    memory = isinstance(trainer, GraphTrainer) and trainer.lacks_memory and LACKS_MEMORY
+    return [message for message in (doubling, target, memory) if message]
 
 
 def _facts(training: Training) -> dict[str, object]:
-    config, state, last = training.config, training.run.state, training.run.state.curve[-1]
+    config, run, state = training.config, training.run, training.run.state
+    last = state.curve[-1]
     return {
         "field": config.field,
         "steps": state.step,
@@ -272,6 +280,7 @@ def _facts(training: Training) -> dict[str, object]:
         "failure_reason": state.failure_reason,
         **precision_facts(config),
         **_rank_facts(training.run),
+        **({"refused_steps": run.trainer.refused} if isinstance(run.trainer, GraphTrainer) else {}),
     }
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from nerf.fields.interface import Rendering
 from nerf.kernels import Samples
-from nerf.kernels.torch.packing import padded, padded_samples
+from nerf.kernels.torch.packing import no_padding, padded, padded_samples
 
 OPAQUE = 800.0
 MIN_KEEP_PROBABILITY = 1 / 16  # of a thin sample to be kept, so that no interval becomes more than 16 times as long
@@ -49,6 +49,7 @@ def visible_samples(
     of_thin = torch.where(probability < 1, probability, 0).double()
     before = sums_before(samples, of_thin) + thinning_offset.double().index_select(0, samples.ray)
     chosen = ~(probability < 1) | ((before + of_thin).floor() > before.floor())
+    chosen &= no_padding(samples)
     index = (chosen & (_transmittances(samples, sigma).before >= threshold)).nonzero()[:, 0]
     starts = torch.searchsorted(index, samples.starts.long(), out_int32=True)
     index = index.int()

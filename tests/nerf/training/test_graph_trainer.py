@@ -1,23 +1,33 @@
-"""Steps with a plan for their samples, as CUDA graphs hold them; where there is a GPU, the graphs themselves."""
+"""Steps with capacities for their samples, as CUDA graphs hold them: computed again on a CPU; graphs where there is a
+GPU."""
 
 from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from nerf.effects import ImageEffects
 from nerf.effects.exposure import ExposureModel
 from nerf.effects.pose_refinement import PoseRefinement
-from nerf.fields.hash_grid import HashGridField, HashGridSettings, SamplePlan
+from nerf.fields.hash_grid import HashGridField, HashGridSettings, SampleCapacities
 from nerf.geometry.space_maps.contraction import Contraction
 from nerf.geometry.space_maps.ndc import Ndc
 from nerf.kernels import Backend, warp
 from nerf.kernels import torch as reference
 from nerf.rendering.early_termination import RoundSize
-from nerf.training.graph_trainer import MIN_SPARE_ROOM, ROOM, GraphTrainer, with_spare_room
-from nerf.training.hash_grid_trainer import HashGridTrainer, MicroBatch
+from nerf.training.graph_trainer import (
+    MIN_SPARE_CAPACITY,
+    SPARE_CAPACITY,
+    Compute,
+    GraphTrainer,
+    ReplayableStep,
+    StepGraph,
+    with_spare,
+)
+from nerf.training.hash_grid_trainer import HashGridBatch, HashGridTrainer, LossWeights, MicroBatch
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite
-from tests.devices import skip_without
+from tests.devices import DEVICES, skip_without
 from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, small_dataset
 
 CONTRACTED = replace(FIELD, space=Contraction(), min_step_size=0.1, cone_angle=0.2, background_model=True)
@@ -34,24 +44,24 @@ def trainer_on(device: str, backend: Backend, field: HashGridSettings = FIELD) -
     return HashGridTrainer(model, dataset, LOSSES, effects)
 
 
-def differentiated(run: HashGridTrainer, plan: SamplePlan | None = None) -> MicroBatch:
+def differentiated(run: HashGridTrainer, given: SampleCapacities | None = None) -> MicroBatch:
     batch = run.draw_batch(3, 0.25, 0, 64)
     rays = run.effects.forward_rays(batch.rays, batch.view)
-    return run.differentiate(batch, rays, 64, run.loss_weights(64, 0.25), plan)
+    return run.differentiate(batch, rays, 64, run.loss_weights(64, 0.25), given)
 
 
 @pytest.mark.parametrize("backend", [reference, warp], ids=["reference", "warp"])
 @pytest.mark.parametrize("field", [FIELD, CONTRACTED, FORWARD], ids=["box", "contracted", "ndc"])
-def test_a_plan_with_room_changes_no_gradient(backend: Backend, field: HashGridSettings) -> None:
+def test_capacities_that_suffice_change_no_gradient(backend: Backend, field: HashGridSettings) -> None:
     run = trainer_on("cpu", backend, field)
     for step in range(20):
         run.take_step(step, 0.1, 1.0)
     exact = differentiated(run)
-    plan = with_spare_room(exact.room, run.model.stepping.max_samples)
-    padded = differentiated(run, plan)
-    assert exact.fits and padded.fits and len(padded.points) == plan.visible > len(exact.points) > 100
+    given = with_spare(exact.capacities, SPARE_CAPACITY, run.model.stepping.max_samples)
+    padded, needed = differentiated(run, given), sum(each.capacity for each in exact.capacities.rounds)
+    assert exact.fits and padded.fits and len(padded.points) == given.visible > len(exact.points) > 100
     assert int(padded.colour_evaluations) == len(exact.points)
-    assert padded.density_evaluations == exact.density_evaluations == sum(each.capacity for each in exact.room.rounds)
+    assert padded.density_evaluations == exact.density_evaluations == needed
     for name in ("loss", "squared_error", "grad_norm", "grad_networks", "grad_background", "grad_effects"):
         torch.testing.assert_close(getattr(padded, name), getattr(exact, name), rtol=1e-4, atol=1e-8)
     for name in ("points", "grad_features", "optical_thickness"):
@@ -60,79 +70,108 @@ def test_a_plan_with_room_changes_no_gradient(backend: Backend, field: HashGridS
         assert name != "grad_features" or not padding.any()
 
 
-def test_samples_without_room_are_noticed() -> None:
+def test_samples_beyond_the_capacities_are_noticed() -> None:
     run = trainer_on("cpu", warp)
-    room = differentiated(run).room
-    (only,) = room.rounds
+    needed = differentiated(run).capacities
+    (only,) = needed.rounds
     plenty = RoundSize(only.per_ray, 1 << 16)
-    assert differentiated(run, SamplePlan((plenty,), 1 << 16)).fits
-    assert not differentiated(run, SamplePlan((only,), 1 << 16)).fits
-    assert not differentiated(run, SamplePlan((plenty,), room.visible)).fits
-    assert not differentiated(run, SamplePlan((plenty._replace(per_ray=3),), 1 << 16)).fits
+    assert differentiated(run, SampleCapacities((plenty,), 1 << 16)).fits
+    assert not differentiated(run, SampleCapacities((only,), 1 << 16)).fits
+    assert not differentiated(run, SampleCapacities((plenty,), needed.visible)).fits
+    assert not differentiated(run, SampleCapacities((plenty._replace(per_ray=3),), 1 << 16)).fits
     split = (plenty._replace(per_ray=3), plenty._replace(per_ray=run.model.stepping.max_samples - 3))
-    assert differentiated(run, SamplePlan(split, 1 << 16)).fits
+    assert differentiated(run, SampleCapacities(split, 1 << 16)).fits
 
 
-def test_room_to_spare_stays_within_what_a_ray_may_have() -> None:
-    room = SamplePlan((RoundSize(8, 1000), RoundSize(40, 10)), 500)
-    plan = with_spare_room(room, max_samples=1024)
-    assert plan.rounds[0] == RoundSize(8, 1150 + MIN_SPARE_ROOM) and plan.rounds[1].per_ray == 80
-    assert with_spare_room(room, max_samples=60).rounds[1].per_ray == 52
+def test_spare_capacity_stays_within_what_a_ray_may_have() -> None:
+    needed = SampleCapacities((RoundSize(8, 1000), RoundSize(40, 10)), 500)
+    more = with_spare(needed, 1.5, max_samples=1024)
+    assert more.rounds[0] == RoundSize(8, 1500 + MIN_SPARE_CAPACITY) and more.rounds[1].per_ray > 80
+    assert with_spare(needed, SPARE_CAPACITY, max_samples=1024).rounds[1].per_ray == 80
+    assert with_spare(needed, SPARE_CAPACITY, max_samples=60).rounds[1].per_ray == 52
 
 
-@pytest.fixture
-def on_gpu() -> GraphTrainer:
-    skip_without("cuda")
-    return GraphTrainer(trainer_on("cuda", warp))
+class Recomputed:
+    """What a graph computes, on any device."""
+
+    def __init__(
+        self, compute: Compute, batch: HashGridBatch, weights: LossWeights, previous: ReplayableStep | None = None
+    ) -> None:
+        self.compute, self.weights, self.rays = compute, weights, len(batch.jitter)
+
+    def replay(self, batch: HashGridBatch, weights: LossWeights) -> tuple[MicroBatch, Tensor]:
+        return self.compute(batch, weights)
 
 
-@pytest.mark.gpu
-def test_a_graph_learns_what_single_launches_learn(on_gpu: GraphTrainer) -> None:
-    apart, graphs = trainer_on("cuda", warp), set[int]()
+@pytest.fixture(params=DEVICES)
+def run(request: pytest.FixtureRequest) -> GraphTrainer:
+    skip_without(request.param)
+    return GraphTrainer(trainer_on(request.param, warp), Recomputed if request.param == "cpu" else StepGraph)
+
+
+def table_of(run: GraphTrainer) -> Tensor:
+    return copied(run.state())["model.table"]
+
+
+def test_a_graph_learns_what_single_launches_learn(run: GraphTrainer) -> None:
+    apart, graphs = trainer_on(str(run.trainer.dataset.device), warp), set[int]()
     for step in range(299):
-        on_gpu.step(step, step / 300)
+        run.step(step, step / 300)
         apart.step(step, step / 300)
-        graphs |= {id(on_gpu.graph)} - {id(None)}
-    assert len(graphs) > 1, "graphs are made anew as the number of rays changes"
-    of_graph, of_apart = on_gpu.step(299, 1.0), apart.step(299, 1.0)
+        graphs |= {id(run.graph)} - {id(None)}
+    assert len(graphs) > 1, "graphs are captured anew as the number of rays changes"
+    assert run.refused < 10
+    of_graph, of_apart = run.step(299, 1.0), apart.step(299, 1.0)
     assert min(of_graph.psnr, of_apart.psnr) > 40
     assert of_graph.colour_evaluations == pytest.approx(of_apart.colour_evaluations, rel=0.2)
     assert of_graph.rays == pytest.approx(of_apart.rays, rel=0.2)
 
 
-@pytest.mark.gpu
-def test_a_graph_refuses_what_is_not_finite_a_step_late(on_gpu: GraphTrainer) -> None:
+def test_a_graph_refuses_what_is_not_finite_a_step_late(run: GraphTrainer) -> None:
     for step in range(200):
-        on_gpu.step(step, 0.5)
-    assert on_gpu.graph is not None and on_gpu.unread is not None
-    (poses,) = on_gpu.effects.rays
-    good = copied(poses.parameters)
-    before = copied(on_gpu.state())["model.table"]
+        run.step(step, 0.5)
+    assert run.graph is not None and run.unread is not None
+    (poses,) = run.effects.rays
+    good, before = copied(poses.parameters), table_of(run)
     poses.parameters["turn"][:, 1] = float("nan")
-    on_gpu.step(200, 0.5)
+    run.step(200, 0.5)
     with pytest.raises(NonFinite, match=f"the {RAY_GEOMETRY} of step 200 is not finite"):
-        on_gpu.step(201, 0.5)
-    assert torch.equal(on_gpu.state()["model.table"], before)
+        run.step(201, 0.5)
+    assert torch.equal(table_of(run), before)
     for name, tensor in poses.parameters.items():
         tensor.copy_(good[name])
     for step in range(202, 205):
-        on_gpu.step(step, 0.5)
+        run.step(step, 0.5)
+    assert not torch.equal(table_of(run), before)
 
 
-@pytest.mark.gpu
-def test_a_step_without_room_changes_nothing(on_gpu: GraphTrainer) -> None:
+def test_a_step_beyond_the_capacities_changes_nothing(run: GraphTrainer) -> None:
     for step in range(200):
-        on_gpu.step(step, 0.5)
-    assert on_gpu.graph is not None
-    batch, weights = on_gpu.graph.batch, on_gpu.graph.weights
-    (first, *_) = differentiated(on_gpu.trainer).room.rounds
-    few = int((50 - MIN_SPARE_ROOM) / ROOM)  # with room to spare that is about 50
-    on_gpu.graph = on_gpu._new_graph(SamplePlan((first._replace(capacity=few),), few), batch, weights)
-    before = copied(on_gpu.state())["model.table"]
-    on_gpu.step(200, 0.5)
-    assert torch.equal(on_gpu.state()["model.table"], before)
-    on_gpu.step(201, 0.5)
-    assert not on_gpu.has_room
-    on_gpu.step(202, 0.5)
-    on_gpu.step(203, 0.5)
-    assert on_gpu.has_room and not torch.equal(on_gpu.state()["model.table"], before)
+        run.step(step, 0.5)
+    rays = run.trainer.rays_per_micro_batch()
+    batch, weights = run.trainer.draw_batch(200, 0.5, 0, rays), run.trainer.loss_weights(rays, 0.5)
+    (first, *_) = differentiated(run.trainer).capacities.rounds
+    few = int((50 - MIN_SPARE_CAPACITY) / SPARE_CAPACITY)  # with what is spared about 50
+    run._capture(SampleCapacities((first._replace(capacity=few),), few), batch, weights)
+    before, spare, refused = table_of(run), run.spare, run.refused
+    run.step(200, 0.5)
+    run.step(201, 0.5)
+    assert torch.equal(table_of(run), before)
+    assert not run.fits and run.refused == refused + 1
+    run.step(202, 0.5)
+    run.step(203, 0.5)
+    run.step(204, 0.5)
+    assert run.fits and run.spare > spare and not torch.equal(table_of(run), before)
+
+
+def test_without_memory_for_a_graph_steps_go_on(run: GraphTrainer) -> None:
+    asked = list[ReplayableStep | None]()
+
+    def no_memory(compute: Compute, batch: HashGridBatch, weights: LossWeights, previous: ReplayableStep | None):
+        asked.append(previous)
+        raise torch.OutOfMemoryError("too much")
+
+    run.capture = no_memory
+    results = [run.step(step, 0.5) for step in range(100)]
+    assert asked == [None, None] and run.lacks_memory and run.graph is None
+    assert results[-1].psnr > results[0].psnr

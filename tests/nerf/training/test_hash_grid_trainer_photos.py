@@ -33,7 +33,7 @@ def part_without_effects(run: HashGridTrainer, step: int, progress: float, rays:
     losses = huber.sum() / (3 * rays), error.square().sum() / (3 * rays)
     learnt = gradients.weights, gradients.features, done.points, dict[str, Tensor](), dict[str, Tensor]()
     counts = done.samples.starts[-1], done.density_evaluations
-    return MicroBatch(batch, *losses, *learnt, norm, done.optical_thickness, *counts, done.room, done.fits)
+    return MicroBatch(batch, *losses, *learnt, norm, done.optical_thickness, *counts, done.capacities, done.fits)
 
 
 def test_effects_that_are_off_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
