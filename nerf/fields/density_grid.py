@@ -6,31 +6,40 @@ Naming: ``values[i, j, k]`` lies at ``low + (i, j, k) * spacing``; the first and
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf.fields.interface import RadianceModel
 from nerf.geometry.rays import Rays, clip_to_box, points_on
 from nerf.runtime.parallel import in_order
 
 
+@runtime_checkable
+class DensityField(Protocol):
+    """What a grid is filled from; a RadianceModel is one."""
+
+    def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
+        """At points of the grid's space, per unit length there."""
+        ...
+
+
 class DensityGrid(NamedTuple):
-    """Values at the vertices of a box; ``low`` and ``high`` are its corners in the scene frame."""
+    """Values at the vertices of a box; ``low`` and ``high`` are its corners in the scene, or in another space whose
+    points and rays are then meant everywhere below."""
 
     values: Float[Tensor, "nx ny nz"]
     low: Float[Tensor, "3"]
     high: Float[Tensor, "3"]
 
     def spacing(self) -> Float[Tensor, "3"]:
-        """Distance between neighbouring vertices along each axis, in scene units."""
+        """Distance between neighbouring vertices along each axis."""
         return (self.high - self.low) / (torch.tensor(self.values.shape, device=self.low.device) - 1)
 
 
 def sample_density_grid(
-    model: RadianceModel,
+    field: DensityField,
     resolution: int,
     low: Float[Tensor, "3"],
     high: Float[Tensor, "3"],
@@ -39,7 +48,7 @@ def sample_density_grid(
 ) -> DensityGrid:
     """Sample the density with ``resolution`` vertices along the longest edge and nearly cubic voxels.
 
-    Points go to the model in chunks of fixed size, so the result does not depend on threads; ``on_chunk`` hears
+    Points go to the field in chunks of fixed size, so the result does not depend on threads; ``on_chunk`` hears
     the finished share after each. Raises ValueError for an empty box or fewer than two vertices along an edge.
     """
     edges = high - low
@@ -53,7 +62,7 @@ def sample_density_grid(
         index = torch.arange(start, min(start + chunk, total), device=low.device)
         i, j, k = torch.unravel_index(index, counts)
         with torch.no_grad():  # a property of the thread
-            return model.density(torch.stack([axes[0][i], axes[1][j], axes[2][k]], dim=-1)).float()
+            return field.density(torch.stack([axes[0][i], axes[1][j], axes[2][k]], dim=-1)).float()
 
     values = torch.empty(total, device=low.device)
     for number, part in enumerate(in_order(density, range(0, total, chunk), low.device)):

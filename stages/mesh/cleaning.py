@@ -3,9 +3,11 @@
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import torch
 from scipy.spatial import KDTree
 
 from stages.contract import StageError
+from stages.mesh.grid_space import VoxelSize
 from stages.mesh.surface import (
     Surface,
     border_indices,
@@ -175,16 +177,17 @@ def _covers(label: np.ndarray, area: np.ndarray, marked: np.ndarray, fraction: f
     return np.bincount(label, area * marked) >= fraction * np.bincount(label, area)
 
 
-def boundary(surface: Surface, box: np.ndarray, voxel: float, cropped: bool = False) -> str:
-    """Where the surface ends: "watertight", or "open" and where, for a grid over a box (2, 3). Of one that was
-    ``cropped`` it is not known which border is the crop's."""
+def boundary(surface: Surface, box: np.ndarray, voxel_size: VoxelSize, cropped: bool = False) -> str:
+    """Where the surface ends: "watertight", or "open" and where, for a grid over a box (2, 3) of its space. Of one that
+    was ``cropped`` it is not known which border is the crop's."""
     if is_watertight(surface):
         return "watertight"
-    border = border_vertices(surface)
+    border = voxel_size.space.forward(torch.from_numpy(border_vertices(surface))).numpy()
     if len(border) == 0:
         return "closed, but not a manifold"
     if cropped:
         return "open, cropped by --mesh.box"
-    at_box = ((border < box[0] + voxel / 2) | (border > box[1] - voxel / 2)).any(axis=1)
+    half = voxel_size.spacing / 2
+    at_box = ((border < box[0] + half) | (border > box[1] - half)).any(axis=1)
     places = [("at the edge of the region", at_box.any()), ("where too few photos see it", not at_box.all())]
     return "open " + " and ".join(place for place, present in places if present)

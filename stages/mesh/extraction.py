@@ -21,6 +21,7 @@ from stages.io.files import read_scene, read_tensors, write_png, write_tensors
 from stages.mesh.cleaning import Cleaned, boundary, clean
 from stages.mesh.decimation import decimate
 from stages.mesh.files import WRITERS, Z_UP_TO_Y_UP, ColouredMesh
+from stages.mesh.grid_space import DensityIn, VoxelSize, grid_space, in_scene
 from stages.mesh.holes import Closed, close_holes
 from stages.mesh.iso_level import DIVERGED_HINT, IsoLevel, check_range, choose_iso_level
 from stages.mesh.marching_cubes import extract_surface
@@ -70,7 +71,7 @@ class Source(NamedTuple):
 
 class Extracted(NamedTuple):
     """``mesh`` in the scene frame, how it came about, what was ``closed``, ``boundary``: where it ends, and the
-    texture with what is known of it. ``voxel`` is in scene units."""
+    texture with what is known of it. ``voxel`` is in scene units, the median over the vertices."""
 
     mesh: ColouredMesh
     iso_level: IsoLevel
@@ -93,17 +94,19 @@ def load(inputs: Inputs, progress: Progress) -> Source:
 
 def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extracted:
     """The mesh of the field; ``config`` must be planned. Raises StageError without a surface."""
-    box = grid_box(source.scene.capture_type, source.points)
-    grid = _density_grid(config, source, box, progress)
-    voxel = float(grid.spacing().max())
+    space = grid_space(source.space)
+    field = DensityIn(space, source.model)
+    box = grid_box(source.scene.capture_type, source.points, space)
+    grid = _density_grid(config, field, box, source.device, progress)
+    voxel_size = VoxelSize(space, float(grid.spacing().max()))
     views = source.scene.of_split("train")
     maps = shadow_maps(
-        grid, source.scene, source.ingest, views, lambda done: progress.update("visibility", 0.4 + 0.1 * done)
+        grid, space, source.scene, source.ingest, views, lambda done: progress.update("visibility", 0.4 + 0.1 * done)
     )
-    iso_level = _iso_level(config, grid, source.model, maps, progress)
+    iso_level = _iso_level(config, grid, field, maps, progress)
     progress.update("marching cubes", 0.5)
-    raw = extract_surface(grid, iso_level.density)
-    visibility = vertex_visibility(raw.vertices, vertex_normals(raw), maps, voxel)
+    raw = in_scene(extract_surface(grid, iso_level.density), space)
+    visibility = vertex_visibility(raw.vertices, vertex_normals(raw), maps, voxel_size.at(raw.vertices))
     progress.update("cleaning", 0.55)
     min_views = min(config.min_views, len(views))
     cleaned = clean(
@@ -111,7 +114,7 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     )
     cropped = _cropped(config, cleaned.surface, source)
     surface = decimate(cropped, config.max_faces or default_faces(config, len(cropped.faces)), source.space)
-    ends = boundary(surface, box, voxel, cropped=len(cropped.faces) < len(cleaned.surface.faces))
+    ends = boundary(surface, box, voxel_size, cropped=len(cropped.faces) < len(cleaned.surface.faces))
     if config.close:
         surface, closed = close_holes(surface, config.close)
         ends = "watertight" if is_watertight(surface) else ends
@@ -119,11 +122,12 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
         closed = Closed(0, 0, 0.0)
     progress.update("colours", 0.6)
     nearest = KDTree(cleaned.surface.vertices).query(surface.vertices)[1]
-    directions = visibility.direction[cleaned.vertex[nearest]]
-    colours = vertex_colours(source.model, cleaned.surface.vertices[nearest], directions, voxel, source.device)
-    textured = _textured(config, surface, colours, source, voxel, progress)
+    directions, of_raw = visibility.direction[cleaned.vertex[nearest]], cleaned.surface.vertices[nearest]
+    colours = vertex_colours(source.model, of_raw, directions, voxel_size.at(of_raw), source.device)
+    voxels = voxel_size.at(surface.vertices)
+    textured = _textured(config, surface, colours, source, voxels, progress)
     mesh = ColouredMesh(*surface, vertex_normals(surface), colours, textured and textured.texture)
-    return Extracted(mesh, iso_level, cleaned, closed, ends, voxel, textured)
+    return Extracted(mesh, iso_level, cleaned, closed, ends, float(np.median(voxels)), textured)
 
 
 def default_faces(config: "Config", found: int) -> int:
@@ -150,7 +154,7 @@ def _cropped(config: "Config", surface: Surface, source: Source) -> Surface:
 
 
 def _textured(
-    config: "Config", surface: Surface, colours: np.ndarray, source: Source, voxel: float, progress: Progress
+    config: "Config", surface: Surface, colours: np.ndarray, source: Source, voxels: np.ndarray, progress: Progress
 ) -> Textured | None:
     """The texture asked for; None for one colour per vertex."""
     if config.texture_size == 0:
@@ -160,59 +164,63 @@ def _textured(
         progress.update(what, 0.65 + 0.3 * done)
 
     textured = texture_of(
-        surface, colours, source.scene, source.ingest, source.info, voxel, config.texture_size, report
+        surface, colours, source.scene, source.ingest, source.info, voxels, config.texture_size, report
     )
     if textured is None:
         progress.note("mesh.no-photo-sees-it", "no photo sees the surface: it has colours of the field and no texture")
     return textured
 
 
-def _density_grid(config: "Config", source: Source, box: np.ndarray, progress: Progress) -> DensityGrid:
+def _density_grid(config: "Config", field: DensityIn, box: np.ndarray, device: str, progress: Progress) -> DensityGrid:
     assert config.resolution is not None
     bytes_per_point = BYTES_PER_POINT * point_cost(slab_factor(box))
     fits = int((available_bytes() / bytes_per_point) ** (1 / 3)) // 16 * 16
     hint = f"Try --mesh.resolution {fits}." if fits >= 16 else "Close other programs."
     needed = bytes_per_point * config.resolution**3
     check_memory(needed, "the mesh", f"a density grid of {config.resolution}³ points needs", hint)
-    low, high = torch.tensor(box, dtype=torch.float32, device=source.device)
+    low, high = torch.tensor(box, dtype=torch.float32, device=device)
 
     def report(done: float) -> None:
         progress.update(f"density at {config.resolution}³ points", 0.4 * done)
 
-    return sample_density_grid(source.model, points_per_edge(box, config.resolution), low, high, CHUNK, report)
+    return sample_density_grid(field, points_per_edge(box, config.resolution), low, high, CHUNK, report)
 
 
 def _iso_level(
-    config: "Config", grid: DensityGrid, model: RadianceModel, maps: list[ShadowMap], progress: Progress
+    config: "Config", grid: DensityGrid, field: DensityIn, maps: list[ShadowMap], progress: Progress
 ) -> IsoLevel:
     """The one asked for, or the one chosen from some of the maps' rays."""
     check_range(grid, config.iso_level)
     if config.iso_level is not None:
         return IsoLevel(config.iso_level, "given", None, True)
-    chosen = choose_iso_level(grid, model, sample_rays(maps, ISO_LEVEL_RAYS))
+    rays = field.space.map_rays(sample_rays(maps, ISO_LEVEL_RAYS)).rays
+    chosen = choose_iso_level(grid, field, rays)
     progress.note("mesh.iso-level", f"surface at density {chosen.density:.3g}: {chosen.reason}")
     return chosen
 
 
 def vertex_colours(
-    model: RadianceModel, vertices: np.ndarray, directions: np.ndarray, voxel: float, device: str
+    model: RadianceModel, vertices: np.ndarray, directions: np.ndarray, voxels: np.ndarray, device: str
 ) -> np.ndarray:
     """sRGB bytes (n, 3): what rays along ``directions`` (n, 3) see from one voxel before each vertex of the raw surface
-    to one behind it.
+    to one behind it; ``voxels`` (n,): how long these are.
 
     A field's colour means something only where the field is dense, and a vertex of a coarse grid may lie beside that.
     Colours are divided by the opacity; where the ray meets nothing, the last sample counts. Raises StageError where
     one is not finite.
     """
-    t = torch.linspace(-voxel, voxel, COLOUR_SAMPLES + 1, device=device)
+    places = torch.linspace(-1, 1, COLOUR_SAMPLES + 1, device=device)
     colours = []
     for start in range(0, len(vertices), CHUNK // COLOUR_SAMPLES):
         some = slice(start, start + CHUNK // COLOUR_SAMPLES)
-        points, views = (torch.tensor(a[some], dtype=torch.float32, device=device) for a in (vertices, directions))
-        samples = points[:, None] + t[:-1, None] * views[:, None]
+        points, views, length = (
+            torch.tensor(a[some], dtype=torch.float32, device=device) for a in (vertices, directions, voxels)
+        )
+        t = length[:, None] * places
+        samples = points[:, None] + t[:, :-1, None] * views[:, None]
         with torch.no_grad():
             density, colour = model.density_and_colour(samples, views[:, None].expand_as(samples))
-            pixel, _ = composite(density, colour, t.expand(len(points), -1), torch.zeros(1, 3, device=device))
+            pixel, _ = composite(density, colour, t, torch.zeros(1, 3, device=device))
         opaque = pixel.opacity[:, None] > 0
         colours.append(torch.where(opaque, pixel.colour / pixel.opacity[:, None], colour[:, -1]))
     found = torch.cat(colours)

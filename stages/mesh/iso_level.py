@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from skimage.filters import threshold_otsu
 
-from nerf.fields.density_grid import DensityGrid, along, first_crossing, ray_distances
-from nerf.fields.interface import RadianceModel
+from nerf.fields.density_grid import DensityField, DensityGrid, along, first_crossing, ray_distances
 from nerf.geometry.rays import Rays, clip_to_box, points_on
 from stages.contract import StageError
 from stages.mesh.marching_cubes import smoothed_occupancy
@@ -70,13 +69,13 @@ def check_range(grid: DensityGrid, iso_level: float | None) -> None:
         raise StageError("mesh.level-out-of-range", f"no surface at density {iso_level:g}", why, hint)
 
 
-def choose_iso_level(grid: DensityGrid, model: RadianceModel, rays: Rays) -> IsoLevel:
+def choose_iso_level(grid: DensityGrid, field: DensityField, rays: Rays) -> IsoLevel:
     """The density whose surface in ``grid`` lies closest to where ``rays`` lose half of their transmittance in
-    ``model``."""
+    the ``field``."""
     inside = clip_to_box(rays, grid.low, grid.high)
     inside = inside.each(lambda part: part[inside.far > inside.near])
     t = ray_distances(inside, SAMPLES_PER_EDGE * max(grid.values.shape))
-    depth, peak = _median_depths(model, inside, t)
+    depth, peak = _median_depths(field, inside, t)
     stopped = torch.isfinite(depth)
     if int(stopped.sum()) < MIN_STOPPED * len(depth) or not stopped.any():
         return _otsu_level(grid, float(stopped.float().mean()) if len(depth) else 0.0)
@@ -103,7 +102,7 @@ def choose_iso_level(grid: DensityGrid, model: RadianceModel, rays: Rays) -> Iso
     return IsoLevel(candidates[best], reason, errors[best], errors[best] < CLIP_VOXELS / 2)
 
 
-def _median_depths(model: RadianceModel, rays: Rays, t: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _median_depths(field: DensityField, rays: Rays, t: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Where each ray has lost half of its transmittance (infinite: nowhere), and the largest density up to there.
 
     The field itself is asked, not the grid: between two grid points a wall thinner than a voxel looks like a ramp that
@@ -114,7 +113,7 @@ def _median_depths(model: RadianceModel, rays: Rays, t: torch.Tensor) -> tuple[t
     with torch.no_grad():
         for row in range(0, len(t), RAY_CHUNK):
             part = slice(row, row + RAY_CHUNK)
-            density[part] = model.density(points_on(rays.each(itemgetter(part)), middle[part])).float()
+            density[part] = field.density(points_on(rays.each(itemgetter(part)), middle[part])).float()
     thickness = torch.nn.functional.pad((density * t.diff(dim=-1)).cumsum(-1), (1, 0))
     depth = first_crossing(thickness, t, math.log(2))
     return depth, torch.where(t[:, :-1] <= depth[:, None], density, 0.0).amax(-1)

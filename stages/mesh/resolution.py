@@ -14,10 +14,12 @@ import torch
 from nerf import REGION_HALF_SIZE
 from nerf.fields.density_grid import DensityGrid, sample_density_grid
 from nerf.geometry.region_of_interest import CaptureType
+from nerf.geometry.space_maps import space_map
 from stages.contract import Inputs, Progress
 from stages.hardware.device import compute_device
 from stages.io.field_files import load_field
 from stages.io.files import read_json, read_scene, read_tensors
+from stages.mesh.grid_space import DensityIn, GridSpace, box_in, grid_space
 from stages.mesh.marching_cubes import extract_surface
 from stages.mesh.surface import vertex_normals
 
@@ -56,8 +58,9 @@ def choose_resolution(seconds: float | None, inputs: Inputs, progress: Progress)
     progress.update("timing the field's density queries")
     began = time.perf_counter()
     points = read_tensors(inputs["normalise"] / "points.safetensors")["xyz"].astype(float)
-    box = grid_box(read_scene(inputs["normalise"]).capture_type, points)
-    query, reference = density_query_seconds(inputs["train"], box), reference_seconds()
+    space = grid_space(space_map(**read_json(inputs["train"] / "field.json")["settings"]["space"]))
+    box = grid_box(read_scene(inputs["normalise"]).capture_type, points, space)
+    query, reference = density_query_seconds(inputs["train"], space, box), reference_seconds()
     return resolution_within(seconds - (time.perf_counter() - began), query, reference, slab_factor(box))
 
 
@@ -67,9 +70,9 @@ def resolution_from_training(rays: int) -> int:
     return min(MAX_RESOLUTION, max(MIN_TRAINED_RESOLUTION, round(edge / 16) * 16))
 
 
-def grid_box(capture_type: CaptureType, points: np.ndarray) -> np.ndarray:
-    """The box of the density grid: the region of interest, or where the scene is flat (ground from the air, a façade,
-    the floor of a house) the slab of it that sparse ``points`` (n, 3) lie in.
+def grid_box(capture_type: CaptureType, points: np.ndarray, space: GridSpace) -> np.ndarray:
+    """The box of the density grid in its ``space``: around the region of interest, or where the scene is flat (ground
+    from the air, a façade, the floor of a house) the slab of it that sparse ``points`` (n, 3) of the scene lie in.
 
     Never a slab where photos were taken around an object: its top may be bare, and points on what it stands on do not
     tell how far it reaches.
@@ -77,13 +80,13 @@ def grid_box(capture_type: CaptureType, points: np.ndarray) -> np.ndarray:
     cube = np.array([[-REGION_HALF_SIZE] * 3, [REGION_HALF_SIZE] * 3])
     points = points[(np.abs(points) <= REGION_HALF_SIZE).all(axis=1)]
     if capture_type == "object-centric" or len(points) < MIN_POINTS:
-        return cube
+        return box_in(space, cube)
     low, high = np.quantile(points, [QUANTILE, 1 - QUANTILE], axis=0)
     flat, side = int((high - low).argmin()), 2 * REGION_HALF_SIZE
     bottom, top = low[flat] - MARGIN * side, high[flat] + MARGIN * side
     if (high - low).max() >= WIDE * side >= top - bottom:
         cube[:, flat] = max(bottom, -REGION_HALF_SIZE), min(top, REGION_HALF_SIZE)
-    return cube
+    return box_in(space, cube)
 
 
 def points_per_edge(box: np.ndarray, resolution: int) -> int:
@@ -118,19 +121,20 @@ def expected_seconds(resolution: int, query: float, reference: float, slab: floa
     return queries * query + (FIXED_COST + COST_PER_POINT * resolution**3 * point_cost(slab)) * reference
 
 
-def density_query_seconds(train: Path, box: np.ndarray) -> float:
-    """Measured seconds per density query of the field in ``train``: larger and larger grids over a box, until one takes
-    long enough to tell."""
+def density_query_seconds(train: Path, space: GridSpace, box: np.ndarray) -> float:
+    """Measured seconds per density query of the field in ``train``: larger and larger grids over a box of their
+    ``space``, until one takes long enough to tell."""
     device = compute_device()
     model, _ = load_field(train, device)
+    field = DensityIn(space, model)
     low, high = torch.tensor(box, dtype=torch.float32, device=device)
-    sample_density_grid(model, TIMED_EDGES[0], low, high, CHUNK)  # the first pays for memory and kernels
+    sample_density_grid(field, TIMED_EDGES[0], low, high, CHUNK)  # the first pays for memory and kernels
     seconds = per_point = 0.0
     for edge in TIMED_EDGES:
         if seconds >= MIN_TIMED_SECONDS:
             break
         began = time.perf_counter()
-        count = sample_density_grid(model, points_per_edge(box, edge), low, high, CHUNK).values.cpu().numel()
+        count = sample_density_grid(field, points_per_edge(box, edge), low, high, CHUNK).values.cpu().numel()
         seconds = time.perf_counter() - began
         per_point = seconds / count
     return per_point

@@ -19,6 +19,7 @@ from nerf.geometry.rays import Rays, join_rays
 from nerf.geometry.scene import Camera, Scene, View
 from nerf.runtime.parallel import in_order
 from nerf.runtime.randomness import generator
+from stages.mesh.grid_space import GridSpace
 from stages.sfm.colmap.cameras import project
 from stages.train.data import view_mask, view_rays
 
@@ -56,10 +57,15 @@ class ShadowMap(NamedTuple):
 
 
 def shadow_maps(
-    grid: DensityGrid, scene: Scene, ingest: Path, views: Sequence[View], on_view: Callable[[float], None]
+    grid: DensityGrid,
+    space: GridSpace,
+    scene: Scene,
+    ingest: Path,
+    views: Sequence[View],
+    on_view: Callable[[float], None],
 ) -> list[ShadowMap]:
     """One map per photo; together about ``NUM_RAYS`` rays, more of many photos, each with a sample per voxel of the
-    longest edge. Masks lie in the folder of stage ``ingest``."""
+    longest edge. ``space``: the grid's. Masks lie in the folder of stage ``ingest``."""
 
     def map_of(view: View) -> ShadowMap:
         camera = scene.cameras[view.camera]
@@ -68,7 +74,9 @@ def shadow_maps(
         downscale = max(shared, longer / MAX_MAP_SIDE, 1.0)
         rays = view_rays(scene, view, downscale)
         rays = rays.each(lambda part: part.to(grid.low.device))
-        depth = median_depth(grid, rays, max(grid.values.shape)).cpu().numpy()
+        mapped = space.map_rays(rays)
+        depth = median_depth(grid, mapped.rays, max(grid.values.shape))[..., None]
+        depth = torch.where(depth.isinf(), depth, mapped.to_scene(depth)).squeeze(-1).cpu().numpy()
         min_cosine = float((rays.directions.cpu().double().numpy() @ view.scene_from_camera[:, 2]).min())
         mask = view_mask(ingest, scene, view, max(1.0, longer / MAX_MASK_SIDE))
         depth = maximum_filter(depth, size=3, mode="nearest")
@@ -103,18 +111,22 @@ def sample_rays(maps: list[ShadowMap], count: int) -> Rays:
     return rays.each(lambda part: part[chosen])
 
 
-def vertex_visibility(vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxel: float) -> Visibility:
-    """The visibility of every vertex in all photos; ``voxel`` is the grid's spacing in scene units."""
+def vertex_visibility(
+    vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxels: np.ndarray
+) -> Visibility:
+    """The visibility of every vertex in all photos; ``voxels`` (n,): the grid's spacing around each, in scene units."""
 
     def of_chunk(start: int) -> Visibility:
         some = slice(start, start + CHUNK)
-        return _chunk_visibility(vertices[some], normals[some], maps, voxel)
+        return _chunk_visibility(vertices[some], normals[some], maps, voxels[some])
 
     chunks = list(in_order(of_chunk, range(0, len(vertices), CHUNK), torch.device("cpu")))
     return Visibility(*map(np.concatenate, zip(*chunks, strict=True)))
 
 
-def _chunk_visibility(vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxel: float) -> Visibility:
+def _chunk_visibility(
+    vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxels: np.ndarray
+) -> Visibility:
     in_frustum = np.zeros(len(vertices), np.int32)
     visible = np.zeros(len(vertices), np.int32)
     total = np.zeros_like(vertices)
@@ -126,7 +138,7 @@ def _chunk_visibility(vertices: np.ndarray, normals: np.ndarray, maps: Sequence[
         in_frustum[inside] += 1
         direction = offset[inside] / distance[inside, None]
         cosine = -(direction * normals[inside]).sum(axis=1)
-        max_distance = shadow_map.depth.reshape(-1)[cell[inside]] + DEPTH_BIAS_VOXELS * voxel
+        max_distance = shadow_map.depth.reshape(-1)[cell[inside]] + DEPTH_BIAS_VOXELS * voxels[inside]
         sees = (cosine > MIN_COSINE) & (distance[inside] <= max_distance)
         visible[inside[sees]] += 1
         total[inside[sees]] += direction[sees] * cosine[sees, None]

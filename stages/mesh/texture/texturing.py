@@ -34,17 +34,17 @@ def texture_of(
     scene: Scene,
     ingest: Path,
     field: dict[str, Any],
-    voxel: float,
+    voxels: np.ndarray,
     max_size: int,
     report: Callable[[str, float], None],
 ) -> Textured | None:
     """The texture of a surface in the scene frame, at most ``max_size`` texels a side. ``field_colours`` (n, 3) sRGB
-    uint8 of the vertices hold where no photo sees them; ``field``: the content of field.json; ``voxel``: how well the
-    surface is known. None where no photo sees any of the surface. Raises StageError where that is too small, too large
-    for the memory, or a photo is gone."""
+    uint8 of the vertices hold where no photo sees them; ``field``: the content of field.json; ``voxels`` (n,): how well
+    the surface is known where. None where no photo sees any of the surface. Raises StageError where that is too small,
+    too large for the memory, or a photo is gone."""
     photos, means = photos_of(scene, ingest, field), neighbour_means(surface)
     candidates = find_candidates(
-        surface, photos, means, voxel, lambda done: report("choosing photos for the texture", 0.5 * done)
+        surface, photos, means, voxels, lambda done: report("choosing photos for the texture", 0.5 * done)
     )
     own = field_colours.astype(np.float32) / 255
     choice = choose(candidates, own, surface.faces, means, len(photos))

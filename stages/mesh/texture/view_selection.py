@@ -93,9 +93,9 @@ def neighbour_means(surface: Surface) -> csr_array:
 
 
 def find_candidates(
-    surface: Surface, photos: Sequence[Photo], means: csr_array, voxel: float, on_photo: Callable[[float], None]
+    surface: Surface, photos: Sequence[Photo], means: csr_array, voxels: np.ndarray, on_photo: Callable[[float], None]
 ) -> Candidates:
-    """The best photos of every vertex. ``voxel``: how well the surface is known, in its unit of length."""
+    """The best photos of every vertex. ``voxels`` (n,): how well it is known where, in its unit of length."""
     count, slots = len(surface.vertices), min(KEPT_PHOTOS, len(photos))
     kept = Candidates(
         np.zeros((count, slots), np.int32),
@@ -111,7 +111,7 @@ def find_candidates(
 
     def seen_by(photo: Photo) -> tuple[np.ndarray, Shown]:
         place = projected(photo, surface.vertices)
-        pixels, counts = _pixels(surface, normals, photo, place, voxel)
+        pixels, counts = _pixels(surface, normals, photo, place, voxels)
         seen = np.flatnonzero(pixels * counts)
         if len(seen) == 0:
             return seen, Shown(pixels[seen], counts[seen], np.zeros((0, 3), np.float32))
@@ -127,7 +127,7 @@ def find_candidates(
 
 
 def _pixels(
-    surface: Surface, normals: np.ndarray, photo: Photo, place: Projection, voxel: float
+    surface: Surface, normals: np.ndarray, photo: Photo, place: Projection, voxels: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """How finely a photo shows each vertex, its sharp pixels per unit of area, 0 where it does not see it; and what
     each of these counts: less towards the photo's borders and next to silhouettes. Both (n,) float32."""
@@ -135,7 +135,7 @@ def _pixels(
     distance = np.linalg.norm(towards, axis=1)
     cosine = (normals * towards).sum(axis=1) / np.maximum(distance, np.finfo(float).tiny)
     ahead = place.inside & (cosine > MIN_COSINE) & (distance >= photo.view.near)
-    clear, near_edge = _visible(surface, photo, place, cosine, voxel)
+    clear, near_edge = _visible(surface, photo, place, cosine, voxels)
     size = np.array([photo.camera.width, photo.camera.height])
     border = np.minimum(place.pixels, size - place.pixels).min(axis=1) / (BORDER * size.min())
     pixels = cosine * (photo.focal_px / np.maximum(distance, np.finfo(float).tiny)) ** 2
@@ -144,7 +144,7 @@ def _pixels(
 
 
 def _visible(
-    surface: Surface, photo: Photo, place: Projection, cosine: np.ndarray, voxel: float
+    surface: Surface, photo: Photo, place: Projection, cosine: np.ndarray, voxels: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which vertices nothing hides, and which of these are next to the silhouette of what lies before them."""
     shrink = max(photo.camera.width, photo.camera.height) / MAX_MAP_SIDE
@@ -157,14 +157,14 @@ def _visible(
         depth = 1 / nearness  # infinite where there is nothing
     focal = photo.focal_px * width / photo.camera.width
     seen = place.inside & ahead
-    middle = float(np.median(place.depth[seen])) if seen.any() else 1.0
-    margin = int(np.clip(np.ceil(MARGIN_VOXELS * voxel * focal / middle), 1, MAX_MARGIN_PX))
+    known = float(np.median(voxels[seen] / place.depth[seen])) if seen.any() else 0.0
+    margin = int(np.clip(np.ceil(MARGIN_VOXELS * focal * known), 1, MAX_MARGIN_PX))
     column, row = np.clip(pixels.astype(np.int64), 0, [width - 1, height - 1]).T
     tangent = np.sqrt(1 / np.maximum(cosine, MIN_COSINE) ** 2 - 1).clip(max=MAX_TANGENT)
     hidden = []
     for reach in (1, margin + 1):
         before = minimum_filter(depth, size=2 * reach + 1, mode="nearest")[row, column]
-        slack = DEPTH_BIAS_VOXELS * voxel + (reach + 0.5) * tangent * place.depth / focal
+        slack = DEPTH_BIAS_VOXELS * voxels + (reach + 0.5) * tangent * place.depth / focal
         hidden.append(place.depth > before + slack)
     return ~hidden[0], hidden[1]
 

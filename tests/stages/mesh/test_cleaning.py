@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from nerf.geometry.space_maps import Box
 from stages.contract import StageError
 from stages.mesh.cleaning import DILATION_STEPS, MIN_POINTS, SUPPORT_RADIUS, boundary, clean
+from stages.mesh.grid_space import VoxelSize
 from stages.mesh.surface import Surface
 from stages.mesh.visibility import Visibility
 from tests.refusals import refused
@@ -177,4 +179,4 @@ def sheet(low, high):
     ],
 )
 def test_the_end_of_a_surface_is_named(surface, words):
-    assert boundary(surface, np.array([[-0.9] * 3, [0.9] * 3]), 0.02) == words
+    assert boundary(surface, np.array([[-0.9] * 3, [0.9] * 3]), VoxelSize(Box(), 0.02)) == words

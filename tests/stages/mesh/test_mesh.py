@@ -178,7 +178,7 @@ class Sheet:
 def test_a_sheet_that_lets_light_through_has_its_own_colour():
     vertices, along_z = np.array([[0.0, 0, 0], [0.3, 0, 5.0]]), np.tile([0.0, 0, 1], (2, 1))
     sheet: Any = Sheet()
-    colours = vertex_colours(sheet, vertices, along_z, VOXEL, "cpu")
+    colours = vertex_colours(sheet, vertices, along_z, np.full(len(vertices), VOXEL), "cpu")
     assert colours.tolist() == [[255, 0, 0], [255, 255, 255]], "the second vertex has nothing about it"
 
 
@@ -309,7 +309,7 @@ def test_a_grid_beyond_memory_is_refused_with_one_that_fits(run_mesh, monkeypatc
 def test_resolution_for_seconds_follows_the_box(run_mesh, monkeypatch):
     asked = []
     monkeypatch.setattr(resolution, "reference_seconds", lambda: 0.02)
-    monkeypatch.setattr(resolution, "density_query_seconds", lambda train, box: asked.append(box) or 2e-7)
+    monkeypatch.setattr(resolution, "density_query_seconds", lambda train, space, box: asked.append(box) or 2e-7)
     points = np.random.default_rng(0).uniform([-0.9, -0.9, -0.25], [0.9, 0.9, -0.15], (1000, 3)).astype(np.float32)
     for capture_type in ("object-centric", "inside-out"):
         scene = replace(scene_around(), capture_type=capture_type)

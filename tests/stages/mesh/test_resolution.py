@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerf import REGION_HALF_SIZE
+from nerf.geometry.space_maps import Box
 from stages.mesh.resolution import (
     FIXED_COST,
     MARGIN,
@@ -62,7 +63,7 @@ def test_the_yardstick_is_the_best_of_a_few(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.parametrize("capture_type", ["forward-facing", "inside-out"])
 def test_a_flat_scenes_grid_spans_its_slice(points, flat, capture_type):
     stray = np.array([[0.1, 0.1, 0.85], [0.5, 0.85, 0.1], [0.0, 0.0, 30.0]])
-    box = grid_box(capture_type, np.concatenate([points, stray]))
+    box = grid_box(capture_type, np.concatenate([points, stray]), Box())
     ends = np.quantile(points[:, flat], [0, 1]) + np.array([-1, 1]) * 2 * REGION_HALF_SIZE * MARGIN
     np.testing.assert_allclose(box[:, flat], ends, atol=0.02)
     rest = [axis for axis in range(3) if axis != flat]
@@ -81,13 +82,13 @@ def test_a_flat_scenes_grid_spans_its_slice(points, flat, capture_type):
     ],
 )
 def test_the_grid_spans_the_region_without_flat_points(points, capture_type):
-    np.testing.assert_array_equal(grid_box(capture_type, points), CUBE)
+    np.testing.assert_array_equal(grid_box(capture_type, points, Box()), CUBE)
 
 
 @pytest.mark.parametrize("resolution", [16, 48, 77, 256])
 def test_a_flat_box_has_as_many_points_and_smaller_voxels(resolution):
     assert points_per_edge(CUBE, resolution) == resolution and slab_factor(CUBE) == pytest.approx(1)
-    box = grid_box("forward-facing", GROUND)
+    box = grid_box("forward-facing", GROUND, Box())
     along = points_per_edge(box, resolution)
     per_edge = (box[1] - box[0]) / 1.8 * (along - 1) + 1
     assert along > 1.3 * resolution

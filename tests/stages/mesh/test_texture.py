@@ -39,6 +39,11 @@ def pattern(points):
     return 0.5 + 0.15 * waves + 0.15 * np.stack([x, y, -x], axis=1)
 
 
+def known(surface):
+    """How well it is known everywhere."""
+    return np.full(len(surface.vertices), 0.05)
+
+
 def sheet(cells=16, half=0.8):
     """The square [-half, half]² at z = 0, seen from above."""
     line = np.linspace(-half, half, cells + 1)
@@ -99,7 +104,7 @@ def baked(tmp_path):
     def bake(surface, scene, effects=None, size=512):
         grey = np.full((len(surface.vertices), 3), GREY, np.uint8)
         field = {"effects": effects or {}}
-        found = texture_of(surface, grey, scene, tmp_path, field, 0.05, size, lambda what, done: None)
+        found = texture_of(surface, grey, scene, tmp_path, field, known(surface), size, lambda what, done: None)
         assert found is not None
         atlas, picture = found.texture
         blocks = list(covered_pixels(atlas.uv[atlas.corner], atlas.width, atlas.height))
@@ -284,7 +289,8 @@ def test_a_photo_that_is_gone_is_named(shoot, baked, tmp_path):
 def test_a_surface_that_no_photo_sees_has_no_texture(shoot, tmp_path):
     turned = sheet()._replace(faces=sheet().faces[:, ::-1])
     grey = np.full((len(turned.vertices), 3), GREY, np.uint8)
-    assert texture_of(turned, grey, shoot(), tmp_path, {"effects": {}}, 0.05, 64, lambda what, done: None) is None
+    found = texture_of(turned, grey, shoot(), tmp_path, {"effects": {}}, known(turned), 64, lambda what, done: None)
+    assert found is None
 
 
 def test_gutters_repeat_the_nearest_texel():

@@ -10,6 +10,7 @@ import torch
 from nerf.fields.density_grid import DensityGrid
 from nerf.geometry.camera_paths import look_at
 from nerf.geometry.scene import Camera, Scene, Similarity, View
+from nerf.geometry.space_maps import Box
 from stages.io.files import write_png
 from stages.mesh.visibility import sample_rays, shadow_maps, unmasked_rays, vertex_visibility
 
@@ -40,8 +41,8 @@ def normals():
 
 
 def looked(grid, scene, vertices, normals):
-    maps = shadow_maps(grid, scene, Path(), scene.views, lambda done: None)
-    return vertex_visibility(vertices, normals, maps, VOXEL)
+    maps = shadow_maps(grid, Box(), scene, Path(), scene.views, lambda done: None)
+    return vertex_visibility(vertices, normals, maps, np.full(len(vertices), VOXEL))
 
 
 def test_one_camera_covers_the_ball_and_sees_its_front(ball, normals):
@@ -109,7 +110,7 @@ def test_many_photos_share_the_rays(ball, monkeypatch):
     told = []
     for count, shape in ((1, (27, 37)), (10, (9, 12)), (40, (8, 10))):
         scene = scene_of(*[(2.5, 0, 0)] * count)
-        maps = shadow_maps(ball, scene, Path(), scene.views, told.append)
+        maps = shadow_maps(ball, Box(), scene, Path(), scene.views, told.append)
         assert [m.depth.shape for m in maps] == [shape] * count
     assert told[0] == told[-1] == 1.0 and len(told) == 51
 
@@ -121,20 +122,20 @@ def test_masked_pixels_are_outside_the_frustum_and_give_no_rays(ball, normals, t
     write_png(tmp_path / "masks" / "0.png", mask)
     scene = scene_of((2.5, 0, 0))
     masked = replace(scene, views=(replace(scene.views[0], mask="masks/0.png"),))
-    maps = shadow_maps(ball, masked, tmp_path, masked.views, lambda done: None)
+    maps = shadow_maps(ball, Box(), masked, tmp_path, masked.views, lambda done: None)
     vertices = RADIUS * normals
     local = (vertices - scene.views[0].scene_from_camera[:, 3]) @ scene.views[0].scene_from_camera[:, :3]
-    visibility = vertex_visibility(vertices, normals, maps, VOXEL)
+    visibility = vertex_visibility(vertices, normals, maps, np.full(len(vertices), VOXEL))
     assert (visibility.in_frustum[local[:, 0] < -0.05] == 0).all() and (
         visibility.in_frustum[local[:, 0] > 0.05] == 1
     ).all()
-    (whole,) = shadow_maps(ball, scene, tmp_path, scene.views, lambda done: None)
+    (whole,) = shadow_maps(ball, Box(), scene, tmp_path, scene.views, lambda done: None)
     assert len(unmasked_rays(maps[0]).near) == pytest.approx(len(unmasked_rays(whole).near) / 2, rel=0.05)
 
 
 def test_rays_are_sampled_from_all_columns_of_the_photos(ball):
     scene = scene_of((2.5, 0, 0))
-    (one,) = maps = shadow_maps(ball, scene, Path(), scene.views, lambda done: None)
+    (one,) = maps = shadow_maps(ball, Box(), scene, Path(), scene.views, lambda done: None)
     rows, columns = one.depth.shape
     drawn = sample_rays(maps, rows)  # as many as every ray of one column would be
     assert len(drawn.near) == rows and torch.equal(drawn.directions, sample_rays(maps, rows).directions)

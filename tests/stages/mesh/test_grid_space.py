@@ -1,0 +1,96 @@
+"""The density grid in normalised device coordinates: the same optical depths, and surfaces near and far."""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerf import REGION_HALF_SIZE
+from nerf.fields.density_grid import median_depth, sample_density_grid
+from nerf.geometry.rays import Rays
+from nerf.geometry.space_maps import Box, Contraction
+from nerf.geometry.space_maps.ndc import Ndc
+from stages.mesh.grid_space import DensityIn, VoxelSize, box_in, grid_space, in_scene
+from stages.mesh.iso_level import choose_iso_level
+from stages.mesh.marching_cubes import extract_surface
+
+APEX, NEAR = (0.0, -1.4, 0.0), 0.6
+FORWARD = Ndc(APEX, ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)), (0.7, 0.7), NEAR)  # looks along +y
+CUBE = np.array([[-REGION_HALF_SIZE] * 3, [REGION_HALF_SIZE] * 3])
+WALLS = {0.9: 0.3, 2.1: 2.0}  # depth: how far to the side; the near one hides the middle of the far one
+THICKNESS = 0.08  # of a wall, times its squared depth: as thick as cells of the field are there
+
+
+class Walls:
+    """A field of walls across the line of sight, all of the same optical thickness."""
+
+    def density(self, points: Tensor) -> Tensor:
+        depth = points[..., 1] - APEX[1]
+        sigma = torch.zeros_like(depth)
+        for wall, half in WALLS.items():
+            inside = (depth > wall) & (depth < wall + THICKNESS * wall**2) & (points[..., 0].abs() < half)
+            sigma = torch.where(inside, 60 / wall**2, sigma)
+        return sigma
+
+
+def rays_ahead(count: int) -> Rays:
+    side = torch.linspace(-0.55, 0.55, count)
+    directions = torch.stack([side, torch.ones(count), 0.3 * side], -1)
+    length = directions.norm(dim=-1, keepdim=True)
+    origin = torch.tensor(APEX).repeat(count, 1)
+    return Rays(origin, directions / length, torch.full((count,), 0.3), torch.full((count,), 6.0))
+
+
+def test_only_cameras_that_face_one_way_have_a_space_of_their_own() -> None:
+    assert grid_space(FORWARD) is FORWARD
+    assert grid_space(Contraction()) == grid_space(Box()) == Box()
+    np.testing.assert_array_equal(box_in(Box(), CUBE), CUBE)
+
+
+def test_the_box_holds_what_the_space_shows_of_the_region() -> None:
+    low, high = box_in(FORWARD, CUBE)
+    points = torch.from_numpy(np.random.default_rng(0).uniform(*CUBE, (4000, 3)))
+    mapped = FORWARD.forward(points).numpy()
+    shown = np.all(np.abs(mapped) <= FORWARD.half, axis=1)
+    assert shown.sum() > 500 and np.all((mapped[shown] >= low) & (mapped[shown] <= high))
+    assert high[2] < FORWARD.half - 0.1, "nothing is sampled beyond the region, to infinity"
+
+
+def test_voxels_are_as_long_as_the_inverse_map_makes_them() -> None:
+    vertices = np.array([[0.1, -0.6, 0.05], [0.0, 0.0, 0.0], [-0.3, 0.8, 0.2]])
+    found = VoxelSize(FORWARD, 0.01).at(vertices)
+    mapped = FORWARD.forward(torch.from_numpy(vertices))
+    towards = torch.tensor([0.0, 0.0, 0.005], dtype=torch.float64)
+    measured = (FORWARD.inverse(mapped + towards) - FORWARD.inverse(mapped - towards)).norm(dim=-1)
+    np.testing.assert_allclose(found, measured.numpy(), rtol=1e-3)
+    assert found[2] > 4 * found[0]
+    np.testing.assert_array_equal(VoxelSize(Box(), 0.01).at(vertices), 0.01)
+
+
+def test_rays_stop_where_they_stop_in_the_scene() -> None:
+    rays, field = rays_ahead(80), DensityIn(FORWARD, Walls())  # pyright: ignore[reportArgumentType]
+    grid = sample_density_grid(field, 160, *torch.tensor(box_in(FORWARD, CUBE), dtype=torch.float32))
+    mapped = FORWARD.map_rays(rays)
+    depth = mapped.to_scene(median_depth(grid, mapped.rays, 160)[:, None])[:, 0] * rays.directions[:, 1]
+    near = (rays.directions[:, 0] / rays.directions[:, 1]).abs() < 0.3 / 0.95
+    for wall, seen in zip(WALLS, (near, ~near), strict=True):
+        middle = math.log(2) / 60 * wall**2
+        assert seen.sum() >= 20
+        torch.testing.assert_close(depth[seen].median(), torch.tensor(wall + middle), rtol=0.02, atol=0)
+
+
+def found_of_walls(space: Ndc | Box) -> tuple[int, int]:
+    """How many vertices the surface has by the front of each wall."""
+    field = DensityIn(space, Walls())  # pyright: ignore[reportArgumentType]
+    grid = sample_density_grid(field, 96, *torch.tensor(box_in(space, CUBE), dtype=torch.float32))
+    level = choose_iso_level(grid, field, space.map_rays(rays_ahead(200)).rays)
+    depth = in_scene(extract_surface(grid, level.density), space).vertices[:, 1] - APEX[1]
+    near, far = (int((np.abs(depth / wall - 1) < 0.04).sum()) for wall in WALLS)
+    return near, far
+
+
+def test_a_wall_near_by_has_the_share_of_the_vertices_that_photos_show() -> None:
+    (near, far), (near_in_scene, far_in_scene) = found_of_walls(FORWARD), found_of_walls(Box())
+    assert near / far > 1.2 * near_in_scene / far_in_scene > 0
+    assert 0.4 < near / far < 0.6, "a third of the view, and its edges"
