@@ -172,6 +172,20 @@ def test_drag_wheel_and_keys_move_the_camera(ball: Viewer):
     assert np.allclose(ball.run("viewer.navigation.pose.centre"), before["centre"])
 
 
+def test_keys_work_wherever_they_are_not_typed(ball: Viewer):
+    ball.run("byId('panel').hidden && byId('menu').click(); byId('path').open = true")
+    seen = {}
+    for place in ("#menu", "#layer-axes", "#views", "#path-seconds"):
+        ball.page.locator(place).press("2")
+        seen[place] = ball.run("viewer.view")
+        ball.run("viewer.view = 'colour'; viewer.changed()")
+    assert seen == {"#menu": "depth", "#layer-axes": "depth", "#views": "colour", "#path-seconds": "colour"}
+    ball.run("byId('path').open = false; byId('path-seconds').value = 2; byId('menu').click(); viewer.photo = 0")
+    ball.run("viewer.changed()")
+    ball.page.keyboard.press("Escape")
+    assert ball.run("viewer.photo === null && byId('compare').hidden")
+
+
 def test_two_fingers_zoom(ball: Viewer):
     pinch = """() => {
       const finger = (type, id, x) => viewer.canvas.dispatchEvent(new PointerEvent(type, {
@@ -206,13 +220,14 @@ LAYOUT = """() => {
   const seen = [...document.querySelectorAll("button, input, select, summary, output, code")]
     .filter((e) => e.offsetParent !== null && e.textContent + e.id), box = (id) => byId(id).getBoundingClientRect();
   const meet = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
-  const pairs = [["panel", "menu"], ["panel", "compare"], ["compare", "menu"]];
+  const pairs = [["panel", "menu"], ["panel", "canvas"], ["panel", "compare"], ["compare", "menu"]];
   return {
     outside: seen.map((e) => [e.id || e.textContent, e.getBoundingClientRect()])
       .filter(([, { left, right }]) => left < 0 || right > innerWidth),
     overlap: pairs.filter(([a, b]) => meet(box(a), box(b))),
     scrolls: document.documentElement.scrollWidth > innerWidth || byId("panel").scrollWidth > byId("panel").clientWidth,
-    scene: box("canvas").width * box("canvas").height / (innerWidth * innerHeight),
+    scene: box("canvas").width * box("canvas").height > 0.5 * innerWidth * innerHeight,
+    slider: byId("photo-share").offsetWidth >= 100,
   };
 }"""
 
@@ -224,7 +239,7 @@ def test_controls_fit_screens_of_any_size(ball: Viewer, size: tuple[int, int]):
     ball.run("() => { if (byId('panel').hidden) byId('menu').click(); }")
     ball.run("document.querySelectorAll('details').forEach((each) => (each.open = true))")
     ball.run("viewer.photo = 0; viewer.changed()")
-    assert ball.run(LAYOUT) == {"outside": [], "overlap": [], "scrolls": False, "scene": 1}
+    assert ball.run(LAYOUT) == {"outside": [], "overlap": [], "scrolls": False, "scene": True, "slider": True}
     ball.run("document.querySelectorAll('details').forEach((each) => (each.open = false))")
     ball.run("viewer.leavePhoto(); byId('menu').click()")
     ball.page.set_viewport_size({"width": 120, "height": 90})
