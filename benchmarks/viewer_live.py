@@ -1,0 +1,103 @@
+"""How soon the page of `pipeline view` shows a training that runs, and that a kill of either side loses nothing.
+
+    python -m benchmarks.viewer_live WORKSPACE
+
+WORKSPACE is finished up to stage effects. A training begins, OPENS pages are opened one after the other, each when
+nobody has watched for QUIET_SECONDS. Then the server is killed and started anew, and the training is killed and
+resumed; two pages of two servers follow it to the end that one of them asks for. Seconds count from the opening of a
+page until it has a field, and until this is drawn: here in software, on the cores that train.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from benchmarks.record import Record, add_out
+from tests.stages.viewer.browser import Viewer, chromium
+
+OPENS, QUIET_SECONDS = 4, 12.0  # more than a server and a training take to forget a page
+SIZE = (320, 240)
+LONG = 3600  # seconds of the training, which is asked to finish before
+
+
+@contextmanager
+def program(*words: str) -> Iterator[subprocess.Popen[str]]:
+    """`pipeline` with these words, killed in the end."""
+    running = subprocess.Popen([sys.executable, "-m", "pipeline", *words], stdout=subprocess.PIPE, text=True)
+    try:
+        yield running
+    finally:
+        running.kill()
+        running.wait()
+
+
+@contextmanager
+def served(root: Path) -> Iterator[str]:
+    """The address of a server of the workspace."""
+    with program("view", str(root), "--json") as server:
+        assert server.stdout is not None
+        yield json.loads(server.stdout.readline())["url"]
+
+
+def opened(browser: Any, url: str) -> tuple[Viewer, dict[str, float]]:
+    """A page, once it shows a field, and when it did."""
+    began = time.monotonic()
+    page = Viewer(browser, url, *SIZE)
+    page.until("follower.shown")
+    shown = time.monotonic() - began
+    page.until("viewer.renderer.presented")
+    return page, {"field_seconds": round(shown, 1), "picture_seconds": round(time.monotonic() - began, 1)}
+
+
+def step_after(page: Viewer, step: int) -> int:
+    """The step that the page tells once the training has done another."""
+    page.until(f"follower.state.phase === 'training' && follower.state.step > {step}")
+    return page.run("follower.state.step")
+
+
+def follow(browser: Any, root: Path, record: Record) -> None:
+    """One training: opened, killed, resumed, finished."""
+    train = ("train", str(root), "--train.seconds", str(LONG), "--train.checkpoint-seconds", "10")
+    with program(*train), served(root) as url:
+        page, _ = opened(browser, url)  # loading ends before this one shows anything
+        for _ in range(OPENS):
+            page.close()
+            time.sleep(QUIET_SECONDS)
+            page, times = opened(browser, url)
+            record.add(what="a page is opened", step=page.run("follower.state.step"), **times)
+        step = step_after(page, page.run("follower.state.step"))
+    page.until("document.getElementById('live-phase').textContent.includes('server has ended')")
+    page.close()
+    with program(*train) as training, served(root) as one, served(root) as two:
+        page, times = opened(browser, one)
+        resumed = page.run("follower.state.step")
+        record.add(what=f"both were killed after step {step} and started again", step=resumed, **times)
+        other, times = opened(browser, two)
+        record.add(what="a second viewer", step=other.run("follower.state.step"), **times)
+        step_after(page, max(600, resumed))
+        other.run("document.getElementById('finish').click()")
+        for each in (page, other):
+            each.until("follower.shown === 'finished'")
+        steps = [each.run("follower.state.step") for each in (page, other)]
+        assert training.wait() == 0 and steps[0] == steps[1] and page.faults == other.faults == []
+        record.add(what="finished, in both viewers", step=steps[0])
+
+
+def main() -> None:
+    """The rows of one workspace."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("workspace", type=Path)
+    add_out(parser)
+    given = parser.parse_args()
+    with chromium() as browser:
+        follow(browser, given.workspace, Record(given.out))
+
+
+if __name__ == "__main__":
+    main()
