@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 from benchmarks.record import Record, add_out
 from tests.stages.viewer.browser import Viewer, chromium
@@ -45,6 +46,15 @@ def served(root: Path) -> Iterator[str]:
         yield json.loads(server.stdout.readline())["url"]
 
 
+def wait_for_fields(url: str) -> None:
+    """Until the training has loaded its photos: a page that was opened before would load anew."""
+    state: dict[str, Any] = {}
+    while state.get("phase") != "training" or not state["field"]:
+        time.sleep(1)
+        with urlopen(url + "state") as answer:
+            state = json.load(answer)
+
+
 def opened(browser: Any, url: str) -> tuple[Viewer, dict[str, float]]:
     """A page, once it shows a field, and when it did."""
     began = time.monotonic()
@@ -53,6 +63,14 @@ def opened(browser: Any, url: str) -> tuple[Viewer, dict[str, float]]:
     shown = time.monotonic() - began
     page.until("viewer.renderer.presented")
     return page, {"field_seconds": round(shown, 1), "picture_seconds": round(time.monotonic() - began, 1)}
+
+
+def opened_unwatched(browser: Any, url: str, record: Record) -> Viewer:
+    """A page, opened when nobody has watched for a while."""
+    time.sleep(QUIET_SECONDS)
+    page, times = opened(browser, url)
+    record.add(what="a page is opened", step=page.run("follower.state.step"), **times)
+    return page
 
 
 def step_after(page: Viewer, step: int) -> int:
@@ -65,16 +83,15 @@ def follow(browser: Any, root: Path, record: Record) -> None:
     """One training: opened, killed, resumed, finished."""
     train = ("train", str(root), "--train.seconds", str(LONG), "--train.checkpoint-seconds", "10")
     with program(*train), served(root) as url:
-        page, _ = opened(browser, url)  # loading ends before this one shows anything
-        for _ in range(OPENS):
-            page.close()
-            time.sleep(QUIET_SECONDS)
-            page, times = opened(browser, url)
-            record.add(what="a page is opened", step=page.run("follower.state.step"), **times)
+        wait_for_fields(url)
+        for _ in range(OPENS - 1):
+            opened_unwatched(browser, url, record).close()
+        page = opened_unwatched(browser, url, record)
         step = step_after(page, page.run("follower.state.step"))
     page.until("document.getElementById('live-phase').textContent.includes('server has ended')")
     page.close()
     with program(*train) as training, served(root) as one, served(root) as two:
+        wait_for_fields(one)
         page, times = opened(browser, one)
         resumed = page.run("follower.state.step")
         record.add(what=f"both were killed after step {step} and started again", step=resumed, **times)
