@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages.io.files import write_json, write_tensors
-from stages.mesh.preview import SMALL_COPY
+from stages.io.files import SMALL_COPY, write_json, write_tensors
 from tests.stages.report.report_workspace import make_workspace, written
 from tests.stages.viewer.browser import WAIT_SECONDS, chromium
 

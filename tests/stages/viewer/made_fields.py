@@ -16,8 +16,7 @@ from nerf.kernels.torch.occupancy import cell_corners
 from nerf.runtime.randomness import generator
 from stages.hardware.backend import load_backend
 from stages.io.field_files import save_field
-from stages.io.files import write_json, write_tensors
-from stages.mesh.preview import SMALL_COPY
+from stages.io.files import SMALL_COPY, write_json, write_tensors
 from tests.stages.photo_scene import photographed, pose_towards_origin
 
 CELLS = 16
