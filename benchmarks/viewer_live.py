@@ -3,9 +3,10 @@
     python -m benchmarks.viewer_live WORKSPACE
 
 WORKSPACE is finished up to stage effects. A training begins, OPENS pages are opened one after the other, each when
-nobody has watched for QUIET_SECONDS. Then the server is killed and started anew, and the training is killed and
-resumed; two pages of two servers follow it to the end that one of them asks for. Seconds count from the opening of a
-page until it has a field, and until this is drawn: here in software, on the cores that train.
+nobody has watched for QUIET_SECONDS. Then the server is killed, and another shows a page as soon as it has started;
+server and training are killed, the training is resumed, and two pages of two servers follow it to the end that one of
+them asks for. Seconds count from the opening of a page until it has a field, and until this is drawn: here in
+software, on the cores that train.
 """
 
 import argparse
@@ -82,12 +83,15 @@ def step_after(page: Viewer, step: int) -> int:
 def follow(browser: Any, root: Path, record: Record) -> None:
     """One training: opened, killed, resumed, finished."""
     train = ("train", str(root), "--train.seconds", str(LONG), "--train.checkpoint-seconds", "10")
-    with program(*train), served(root) as url:
-        wait_for_fields(url)
-        for _ in range(OPENS - 1):
-            opened_unwatched(browser, url, record).close()
-        page = opened_unwatched(browser, url, record)
-        step = step_after(page, page.run("follower.state.step"))
+    with program(*train):
+        with served(root) as url:
+            wait_for_fields(url)
+            for _ in range(OPENS):
+                opened_unwatched(browser, url, record).close()
+        with served(root) as url:
+            page, times = opened(browser, url)
+            record.add(what="the server was killed; another starts", step=page.run("follower.state.step"), **times)
+            step = step_after(page, page.run("follower.state.step"))
     page.until("document.getElementById('live-phase').textContent.includes('server has ended')")
     page.close()
     with program(*train) as training, served(root) as one, served(root) as two:
