@@ -23,7 +23,7 @@ from urllib.request import urlopen
 from benchmarks.record import Record, add_out
 from tests.stages.viewer.browser import Viewer, chromium
 
-OPENS, QUIET_SECONDS = 4, 12.0  # more than a server and a training take to forget a page
+OPENS, QUIET_SECONDS = 3, 12.0  # more than a server and a training take to forget a page
 SIZE = (320, 240)
 LONG = 3600  # seconds of the training, which is asked to finish before
 
@@ -97,7 +97,7 @@ def follow(browser: Any, root: Path, record: Record) -> None:
     with program(*train) as training, served(root) as one, served(root) as two:
         wait_for_fields(one)
         page, times = opened(browser, one)
-        resumed = page.run("follower.state.step")
+        resumed = step_after(page, 0)
         record.add(what=f"both were killed after step {step} and started again", step=resumed, **times)
         other, times = opened(browser, two)
         record.add(what="a second viewer", step=other.run("follower.state.step"), **times)
