@@ -25,7 +25,7 @@ from tests.stages.viewer.browser import Viewer, chromium
 
 OPENS, QUIET_SECONDS = 3, 12.0  # more than a server and a training take to forget a page
 SIZE = (320, 240)
-LONG = 3600  # seconds of the training, which is asked to finish before
+LONG = 3600 + int(time.time()) % 3600  # seconds of the training, which is asked to finish before; one like it is cached
 
 
 @contextmanager
