@@ -5,9 +5,9 @@
     python -m benchmarks.viewer_page demo/demo.nerf --truth demo/truth.json
 
 A row per test photo: PSNR between the page's picture and the renderer's, at SIDE pixels, without distortion: of the
-field as it was trained, and in the bits that the page has; samples per pixel; how much better or worse the page's
-picture scores against its small photo than the renderer's. With --truth (of `pipeline demo`'s photos) also lengths
-between points that are clicked: the median error of LENGTHS of them.
+field as it was trained, and in the bits that the page has; samples per pixel; how much worse the renderer's picture
+scores against the page's small photo in these bits; how much better or worse the page's picture does. With --truth (of
+`pipeline demo`'s photos) also lengths between points that are clicked: the median error of LENGTHS of them.
 """
 
 import argparse
@@ -76,6 +76,7 @@ def pictures(page: Viewer, renderer: Renderer, info: dict[str, Any], scene: Scen
         "agreement_db": round(psnr(drawn, colour), 1),
         "agreement_in_bits_db": round(psnr(drawn, in_bits), 1),
         "samples_per_pixel": round(samples_per_pixel(page, size[0], size[1], request), 1),
+        "bits_cost_db": round(psnr(colour, pixels) - psnr(in_bits, pixels), 3),
         "score_difference_db": round(psnr(drawn, pixels) - psnr(colour, pixels), 3),
     }
 
@@ -128,7 +129,7 @@ def main() -> None:
             tests = [index for index, view in enumerate(scene.views) if view.split == "test"][: given.photos]
             for index in tests:
                 figures = pictures(page, load_renderer(train), read_json(train / "field.json"), scene, index)
-                if truth is not None:
+                if truth is not None and scene.views[index].name in truth.poses:
                     figures["length_error_percent"] = length_error(page, truth, scene, scene.views[index], index)
                 record.add(scene=root.name.removesuffix(".nerf"), photo=scene.views[index].name, **figures)
             page.close()

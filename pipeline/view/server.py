@@ -81,9 +81,10 @@ class ViewServer:
 
     def run(self) -> None:
         """Until Ctrl-C, which arrives as KeyboardInterrupt, or :meth:`stop`."""
+        # Before the niceness, which is a thread's own on Linux: on cores that train, loading torch would take a minute.
+        threading.Thread(target=self.state.prepare, daemon=True).start()
         if hasattr(os, "nice"):
             os.nice(NICENESS)
-        threading.Thread(target=self.state.prepare, daemon=True).start()
         self.server.run(sockets=[self.listener])
 
     def stop(self) -> None:

@@ -55,10 +55,14 @@ class WorkspaceState:
         self.of_scene: tuple[Path, ...] = ()
         self.packed: tuple[str, bytes] = ("", b"")
 
-    @staticmethod
-    def prepare() -> None:
-        """Load what packs fields, which takes seconds, before the first page asks for one."""
+    def prepare(self) -> None:
+        """Load what packs fields, which takes seconds, and pack the one that a running training has, before the first
+        page asks for it."""
         import stages.viewer.live  # noqa: F401
+
+        training = self.training()
+        if training.phase == "training" and training.field:
+            self.field(training.field)
 
     def training(self) -> Training:
         """The training that the workspace's recorded run has, or is to have."""

@@ -38,9 +38,11 @@ def save_field(folder: Path, model: RadianceModel, info: dict[str, Any]) -> None
 
 
 def load_field(
-    folder: Path, device: str = "cpu", progress: Progress | None = None
+    folder: Path, device: str = "cpu", progress: Progress | None = None, renders: bool = True
 ) -> tuple[RadianceModel, dict[str, Any]]:
     """The field in ``folder``, ready to render, and the content of its field.json.
+
+    One that never ``renders``, whose numbers alone are wanted, has torch's kernels: to load Warp takes seconds.
 
     One with colour effects comes as new views show it, in an AppearanceModel. ``progress`` is told why a grid field is
     computed by torch's kernels: they trained it, or Warp's do not run on ``device``.
@@ -51,7 +53,7 @@ def load_field(
     info = read_json(folder / "field.json")
     try:
         weights = folder / "field.safetensors"
-        model = _untrained(info, weights.stat().st_size, device, progress)
+        model = _untrained(info, weights.stat().st_size, device, progress, renders)
         model.load_state_dict(load(weights.read_bytes()))  # load_file takes paths in Unicode alone
         check_learnt_colours(info)
     except ValidationError as error:
@@ -76,7 +78,7 @@ def load_field(
 
 
 def _untrained(
-    info: dict[str, Any], stored: int, device: str, progress: Progress | None
+    info: dict[str, Any], stored: int, device: str, progress: Progress | None, renders: bool
 ) -> VanillaNerf | HashGridField:
     """The field that ``info`` describes; ``stored`` is the size of its weights in bytes, which it must not exceed.
     Raises ValueError, before anything is allocated."""
@@ -88,7 +90,9 @@ def _untrained(
         HashGridSettings(**named)  # which refuses unknown names; their types are checked next
         grid = TypeAdapter(HashGridSettings).validate_json(text, strict=True)
         _check_size(grid.layout.rows * grid.features_per_level, stored)
-        return HashGridField(grid, 0, load_backend(backend_of_field(_trained_with(info), device, progress), device))
+        trained_with = _trained_with(info)
+        backend = backend_of_field(trained_with, device, progress) if renders else "torch"
+        return HashGridField(grid, 0, load_backend(backend, device))
     VanillaSettings(**named)
     vanilla = TypeAdapter(VanillaSettings).validate_json(text, strict=True)
     _check_size(vanilla.depth * vanilla.width**2, stored)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
 
 T = TypeVar("T")
+SMALL_COPY = "small_mesh.safetensors"  # of stage mesh, for pages, which are to load without its libraries
 
 
 def write_json(path: Path, value: Any) -> None:

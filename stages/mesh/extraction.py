@@ -17,7 +17,7 @@ from stages.effects.image_effects import learnt_poses, new_view_words
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_bytes, check_memory
 from stages.io.field_files import load_field
-from stages.io.files import read_scene, read_tensors, write_png, write_tensors
+from stages.io.files import SMALL_COPY, read_scene, read_tensors, write_png, write_tensors
 from stages.mesh.cleaning import Cleaned, boundary, clean
 from stages.mesh.decimation import decimate
 from stages.mesh.files import WRITERS, Z_UP_TO_Y_UP, ColouredMesh
@@ -25,7 +25,7 @@ from stages.mesh.grid_space import DensityIn, VoxelSize, grid_space, in_scene
 from stages.mesh.holes import Closed, close_holes
 from stages.mesh.iso_level import DIVERGED_HINT, IsoLevel, check_range, choose_iso_level
 from stages.mesh.marching_cubes import extract_surface
-from stages.mesh.preview import SMALL_COPY, preview, small_copy
+from stages.mesh.preview import preview, small_copy
 from stages.mesh.resolution import CHUNK, grid_box, point_cost, points_per_edge, slab_factor
 from stages.mesh.surface import Surface, face_areas, is_watertight, keep_faces, vertex_normals
 from stages.mesh.texture.texturing import Textured, texture_of

@@ -16,7 +16,6 @@ UP = np.array([0.0, 0.0, 1.0])
 ELEVATION = 30.0  # degrees above the horizon
 ROOM_FIELD_OF_VIEW = 75.0
 MIN_HORIZONTAL = 0.3  # least horizontal part of a direction for its azimuth to count: 73° above the horizon
-SMALL_COPY = "small_mesh.safetensors"
 SMALL_FACES, MAX_SMALL_VERTICES = 20_000, 65_536  # of the copy that turns: 0.3 MB in a page; indices have 16 bits
 COLOUR_SHADING = 0.35  # the colours hold the shading of the photos already
 

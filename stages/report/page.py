@@ -16,9 +16,8 @@ from stages.contract import Inputs
 from stages.evaluate.summary import scored_on
 from stages.io.amounts import duration, short_count
 from stages.io.ascii_names import shell_quoted
-from stages.io.files import read_json, read_scene, read_tensors
+from stages.io.files import SMALL_COPY, read_json, read_scene, read_tensors
 from stages.io.pixels import load_pixels, pillow
-from stages.mesh.preview import SMALL_COPY
 from stages.report.cameras import (
     CameraReport,
     camera_models,

@@ -20,9 +20,8 @@ from nerf.training.metrics import mean_squared_error, psnr
 from stages.contract import Inputs, Progress, StageError
 from stages.effects.image_effects import new_view_effects, new_view_words, photo_effects
 from stages.hardware.device import processors
-from stages.io.files import read_json, read_scene, read_tensors
+from stages.io.files import SMALL_COPY, read_json, read_scene, read_tensors
 from stages.io.photos import spread
-from stages.mesh.preview import SMALL_COPY
 from stages.render.path import median_camera
 from stages.render.renderer import Renderer, load_renderer
 from stages.scale import metres_per_unit

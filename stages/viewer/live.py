@@ -73,7 +73,7 @@ class LiveContents:
         if self.grid is not None and self.settings == field["settings"]:
             self.grid.load_state_dict(load((folder / "field.safetensors").read_bytes()), assign=True)
             return self.grid
-        model, _ = load_field(folder)
+        model, _ = load_field(folder, renders=False)
         grid = model.model if isinstance(model, AppearanceModel) else model
         assert isinstance(grid, HashGridField)
         self.settings, self.grid = field["settings"], grid

@@ -1,5 +1,6 @@
 // A running training: what its server (pipeline/view) tells, and field after field as it comes.
 
+const FIRST_POLL_MS = 300; // before the first field is there
 const POLL_MS = 1000;
 const SLOW_POLL_MS = 3000; // where nothing changes: less than OPEN_SECONDS of the server
 const PATIENCE_MS = 15_000; // fields may come faster than a picture fills in: it is finished first, unless that takes longer
@@ -27,7 +28,8 @@ class Follower {
       await this.follow(state.field);
     } finally {
       const isDone = state?.phase === "finished" && (this.cannot || this.shown === state.field);
-      setTimeout(() => this.poll(), isDone || !state ? SLOW_POLL_MS : POLL_MS);
+      const isWaiting = state?.phase === "training" && !this.shown && !this.cannot;
+      setTimeout(() => this.poll(), isDone || !state ? SLOW_POLL_MS : isWaiting ? FIRST_POLL_MS : POLL_MS);
     }
   }
 

@@ -1,6 +1,7 @@
 // The viewer: what is shown, and how its parts hang together. Its public functions are what tests call, too.
 
 const SAVE_LINK_MS = 400; // without a move until the address holds the view
+const CROSS = 0.012; // half the size of a measured point's cross, of its distance
 const BACKGROUNDS = { white: [1, 1, 1], black: [0, 0, 0] };
 
 class Viewer {
@@ -91,7 +92,9 @@ class Viewer {
 
   drawOver(request, target) {
     const lines = this.crop ? boxLines(this.crop, COLOURS.crop) : [];
-    const above = this.measured.length === 2 ? [[...this.measured, COLOURS.measure]] : [];
+    const crossSize = (point) => CROSS * norm(subtract(point, request.pose.centre));
+    const above = this.measured.flatMap((point) => crossLines(point, crossSize(point), COLOURS.measure));
+    if (this.measured.length === 2) above.push([...this.measured, COLOURS.measure]);
     const { keys } = this.path;
     keys.slice(1).forEach((key, i) => lines.push([keys[i].centre, key.centre, COLOURS.path]));
     this.overlay.draw(request, target, { lines, above }, this.photo);
@@ -136,6 +139,13 @@ class Viewer {
       .sort((a, b) => a.away - b.away);
     const seen = within.find((each) => !this.isHidden(each));
     if (seen) return this.showPhoto(seen.index);
+  }
+
+  /** Whether any camera stands within the view; what hides it aside. */
+  seesCameras() {
+    const { width, height } = this.canvas, lens = fitted(this.lens, width, height);
+    const isWithin = ({ x, y, depth }) => depth > 0 && x > 0 && x < width && y > 0 && y < height;
+    return this.contents.views.some((view) => isWithin(projected(this.navigation.pose, lens, view.pose.centre)));
   }
 
   /** Whether the field's surface lies in front of a point that is seen at pixel (x, y), as in overlay.glsl. */

@@ -9,6 +9,13 @@ const MIN_DISTANCE = 1e-3;
 const STEEPEST = 0.995; // cosine between view and up: an orbit ends before it tips over
 const HELD = new Set(["w", "a", "s", "d", "q", "e", "arrowleft", "arrowright", "arrowup", "arrowdown", "+", "=", "-"]);
 
+/** Whether a key is for the scene: not where it is typed or moves a slider. */
+function isForScene({ target, key, ctrlKey, metaKey, altKey }) {
+  if (ctrlKey || metaKey || altKey) return false;
+  const takesLetters = target.matches("select, [type=number]"), takesOthers = target.matches("button, summary, input");
+  return !takesLetters && !(takesOthers && (key.length > 1 || key === " "));
+}
+
 class Navigation {
   /** `changed()` is called after every move, `clicked(x, y)` with canvas pixels. */
   constructor(canvas, up, changed, clicked) {
@@ -18,9 +25,9 @@ class Navigation {
     for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => this.released(event));
     canvas.addEventListener("wheel", (event) => this.wheeled(event), { passive: false });
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-    canvas.addEventListener("keydown", (event) => this.keyed(event));
-    canvas.addEventListener("keyup", (event) => this.held.delete(event.key.toLowerCase()));
-    canvas.addEventListener("blur", () => this.held.clear());
+    document.addEventListener("keydown", (event) => this.keyed(event));
+    document.addEventListener("keyup", (event) => this.held.delete(event.key.toLowerCase()));
+    window.addEventListener("blur", () => this.held.clear());
   }
 
   get target() {
@@ -144,7 +151,7 @@ class Navigation {
 
   keyed(event) {
     const key = event.key.toLowerCase();
-    if (!HELD.has(key) || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (!HELD.has(key) || !isForScene(event)) return;
     event.preventDefault();
     this.held.add(key);
   }

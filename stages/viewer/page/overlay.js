@@ -7,6 +7,7 @@ const COLOURS = {
 };
 const AXES = [[[1, 0, 0], [0.95, 0.3, 0.3]], [[0, 1, 0], [0.35, 0.8, 0.35]], [[0, 0, 1], [0.4, 0.55, 1]]];
 const OVERLAY_NEAR = 0.01; // scene units
+const LINE_PX = 1.5; // CSS pixels
 const SHADINGS = { plain: 0, coloured: 1, clay: 2 };
 // A point lies behind a surface that is nearer by more than this, for what lies on the surface is to be seen.
 const RELATIVE_MARGIN = 0.01, MARGIN = 0.015; // of the distance; in scene units
@@ -88,7 +89,12 @@ class Overlay {
     const array = this.vertices(positions, new Float32Array(lines.flatMap(([, , c]) => [...c, ...c])));
     this.set({ hides });
     gl.bindVertexArray(array.object);
-    gl.drawArrays(gl.LINES, 0, 2 * lines.length);
+    const [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight], wide = Math.ceil(LINE_PX * (window.devicePixelRatio || 1));
+    for (let place = 0; place < wide * wide; ++place) { // WebGL draws lines of one pixel alone
+      gl.viewport(place % wide, Math.floor(place / wide), width, height);
+      gl.drawArrays(gl.LINES, 0, 2 * lines.length);
+    }
+    gl.viewport(0, 0, width, height);
     gl.bindVertexArray(null);
     gl.deleteVertexArray(array.object);
     array.buffers.forEach((buffer) => gl.deleteBuffer(buffer));
@@ -136,6 +142,11 @@ class Overlay {
     gl.bindVertexArray(null);
     return { object, buffers, faces, count: positions.length / 3 };
   }
+}
+
+/** A cross at a point, along the axes of the scene. */
+function crossLines(point, size, colour) {
+  return AXES.map(([axis]) => [subtract(point, scaled(axis, size)), add(point, scaled(axis, size)), colour]);
 }
 
 /** The edges of a box as lines. */

@@ -18,7 +18,7 @@ class Panels {
     this.cropping();
     this.path();
     this.about();
-    viewer.canvas.addEventListener("keydown", (event) => this.keyed(event));
+    document.addEventListener("keydown", (event) => this.keyed(event));
     this.update();
   }
 
@@ -60,7 +60,8 @@ class Panels {
     this.on("screenshot", "click", () => this.screenshot());
     this.on("link", "click", async () => {
       viewer.writeLink();
-      await navigator.clipboard?.writeText(location.href).then(() => this.say("Copied.", true), () => this.say("The address bar has the link.", true));
+      const copied = navigator.clipboard?.writeText(location.href) ?? Promise.reject();
+      await copied.then(() => this.say("Copied.", true), () => this.say("The address bar has the link.", true));
     });
   }
 
@@ -71,6 +72,7 @@ class Panels {
         viewer.overlay.layers[name] = event.target.checked;
         byId("clay-row").hidden = !viewer.overlay.layers.mesh;
         viewer.renderer.showAgain();
+        if (name === "cameras" && event.target.checked && !viewer.seesCameras()) this.say("The cameras stand outside of the view. Zoom out to see them.", true);
       });
     }
     byId("layer-mesh").disabled = !viewer.contents.mesh;
@@ -183,7 +185,9 @@ class Panels {
 
   keyed(event) {
     const key = event.key.toLowerCase(), view = Object.keys(VIEWS)[Number(key) - 1];
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (key === "escape") this.viewer.playing = false;
+    if (key === "escape" && !byId("compare").hidden) this.viewer.leavePhoto();
+    if (!isForScene(event)) return;
     if (key >= "1" && key <= "4" && key.length === 1) document.querySelector(`input[name="view"][value="${view}"]`).click();
     if (key === "c") byId("layer-cameras").click();
     if (key === "p") byId("layer-points").click();

@@ -15,13 +15,14 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from queue import Queue
 from typing import Any, NamedTuple
 
 import pytest
 
 from pipeline import view
 from pipeline.engine.run_file import RunFile, write
-from pipeline.view.server import ViewServer, listening
+from pipeline.view.server import NICENESS, ViewServer, listening
 from stages.train.live import FINISH, LIVE
 from stages.viewer.page import page, watching
 from tests.pipeline.view.running_training import (
@@ -188,6 +189,17 @@ def test_nothing_but_the_pages_own_is_served(served: Served, running: RunningTra
         and served.ask("state", "POST", Origin=f"http://127.0.0.1:{served.server.port}").status == 405
     )
     assert not (running.partial / LIVE / FINISH).exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere all threads of a program have one niceness")
+def test_it_loads_what_packs_fields_before_it_yields(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    server, seen = ViewServer(tmp_path), Queue[int]()
+    monkeypatch.setattr(server.server, "run", lambda sockets: seen.put(os.getpriority(os.PRIO_PROCESS, 0)))
+    server.state.prepare = lambda: seen.put(os.getpriority(os.PRIO_PROCESS, 0))
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    threading.Thread(target=server.run).start()
+    assert sorted(seen.get(timeout=60) for _ in range(2)) == [before, min(19, before + NICENESS)]
+    server.listener.close()
 
 
 def test_tokens_cannot_be_guessed(tmp_path: Path) -> None:

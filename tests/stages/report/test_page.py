@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages.io.files import write_json, write_tensors
-from stages.mesh.preview import SMALL_COPY
+from stages.io.files import SMALL_COPY, write_json, write_tensors
 from tests.stages.report.report_workspace import make_workspace, written
 from tests.stages.viewer.browser import WAIT_SECONDS, chromium
 
@@ -160,5 +159,8 @@ def test_no_screen_is_too_narrow_and_wide_ones_are_used(tmp_path: Path, progress
         page.set_default_timeout(1000 * WAIT_SECONDS)
         page.goto((tmp_path / "out/report.html").as_uri())
         assert page.evaluate("document.documentElement.scrollWidth") <= width
+        cut_off = """[...document.querySelectorAll(":is(.stages, .effects) :is(th, td)")]
+          .filter((e) => e.getBoundingClientRect().right > innerWidth).map((e) => e.textContent)"""
+        assert page.evaluate(cut_off) == []
         halves = page.evaluate("[...document.querySelectorAll('.half')].map((e) => e.getBoundingClientRect().left)")
         assert len(set(halves)) == (2 if width >= 1280 else 1)

@@ -39,7 +39,7 @@ class Viewer:
     ) -> None:
         self.context = browser.new_context(viewport={"width": width, "height": height}, **options)
         self.page, self.faults = self.context.new_page(), list[str]()
-        self.own = source if isinstance(source, str) else source.as_uri()
+        self.own = source if isinstance(source, str) else source.resolve().as_uri()
         self.page.on("console", lambda message: self._told(message.text))
         self.page.on("pageerror", lambda error: self.faults.append(str(error)))
         self.page.on("request", lambda request: self._requested(request.url))

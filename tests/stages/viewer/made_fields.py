@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
+from nerf.fields.mlp import HIDDEN
 from nerf.geometry.scene import Scene
 from nerf.geometry.space_maps import Box, SpaceMap
 from nerf.geometry.space_maps.contraction import Contraction
@@ -15,11 +16,12 @@ from nerf.kernels.torch.occupancy import cell_corners
 from nerf.runtime.randomness import generator
 from stages.hardware.backend import load_backend
 from stages.io.field_files import save_field
-from stages.io.files import write_json, write_tensors
-from stages.mesh.preview import SMALL_COPY
+from stages.io.files import SMALL_COPY, write_json, write_tensors
 from tests.stages.photo_scene import photographed, pose_towards_origin
 
 CELLS = 16
+CUBE = 0.45  # half the side of the solid cube: whole cells of a box
+LOG_DENSITY = 8.0  # of the solid cube: half of the light stops within 0.0003
 AHEAD = pose_towards_origin(0.0)[:, :3].T
 SPACES: dict[str, SpaceMap] = {
     "box": Box(),
@@ -102,6 +104,20 @@ def random_field(space: SpaceMap, background_model: bool, view_dependence: bool)
     centres = cell_corners(CELLS, torch.arange(CELLS**3)) + 0.5 / CELLS
     kept = torch.rand(len(centres), generator=random) < 0.5 - (centres - 0.5).norm(dim=-1)
     field.set_occupancy(field.backend.occupancy_bits(kept.float(), 0.5))
+    return field
+
+
+def solid_cube() -> HashGridField:
+    """Dense from -CUBE to CUBE on each axis, empty elsewhere: its surface is known exactly."""
+    settings = HashGridSettings(
+        num_levels=1, log2_hashmap_size=10, base_res=4, max_res=4, diagonal_steps=1024, occupancy_resolution=CELLS
+    )
+    field = HashGridField(settings, 0, load_backend("torch", "cpu"))
+    for numbers, value in ((field.table, 1.0), (field.density_hidden, 0.25), (field.density_out, LOG_DENSITY / HIDDEN)):
+        numbers.fill_(value)
+    centres = cell_corners(CELLS, torch.arange(CELLS**3)) + 0.5 / CELLS
+    inside = ((centres - 0.5).abs() < CUBE / (2 * Box().half)).all(dim=-1)
+    field.set_occupancy(field.backend.occupancy_bits(inside.float(), 0.5))
     return field
 
 

@@ -14,14 +14,14 @@ from nerf.rendering.srgb import linear_light, srgb_values
 from stages import train, viewer
 from stages.contract import run_stage
 from stages.effects.image_effects import photo_effects
-from stages.io.field_files import load_field
+from stages.io.field_files import load_field, save_field
 from stages.io.files import read_json, write_json
 from stages.render.path import path_from_file
 from stages.viewer.tables import quantised, with_table
 from tests.conftest import RecordedProgress
 from tests.stages.photo_scene import FOCAL, HEIGHT, WIDTH, ball_photo, photographed
 from tests.stages.viewer.browser import Viewer, chromium, pinhole_rays, psnr, rendered, request_of
-from tests.stages.viewer.made_fields import NAMES, Made, gains, inside_pose, made, renamed
+from tests.stages.viewer.made_fields import CUBE, NAMES, Made, gains, inside_pose, made, renamed, solid_cube
 
 MIN_AGREEMENT = 45.0  # dB; 8 bits of a picture alone leave 59
 LENS = [48, 36, 40.0, 41.0, 22.0, 19.0]
@@ -172,6 +172,20 @@ def test_drag_wheel_and_keys_move_the_camera(ball: Viewer):
     assert np.allclose(ball.run("viewer.navigation.pose.centre"), before["centre"])
 
 
+def test_keys_work_wherever_they_are_not_typed(ball: Viewer):
+    ball.run("byId('panel').hidden && byId('menu').click(); byId('path').open = true")
+    seen = {}
+    for place in ("#menu", "#layer-axes", "#views", "#path-seconds"):
+        ball.page.locator(place).press("2")
+        seen[place] = ball.run("viewer.view")
+        ball.run("viewer.view = 'colour'; viewer.changed()")
+    assert seen == {"#menu": "depth", "#layer-axes": "depth", "#views": "colour", "#path-seconds": "colour"}
+    ball.run("byId('path').open = false; byId('path-seconds').value = 2; byId('menu').click(); viewer.photo = 0")
+    ball.run("viewer.changed()")
+    ball.page.keyboard.press("Escape")
+    assert ball.run("viewer.photo === null && byId('compare').hidden")
+
+
 def test_two_fingers_zoom(ball: Viewer):
     pinch = """() => {
       const finger = (type, id, x) => viewer.canvas.dispatchEvent(new PointerEvent(type, {
@@ -206,13 +220,14 @@ LAYOUT = """() => {
   const seen = [...document.querySelectorAll("button, input, select, summary, output, code")]
     .filter((e) => e.offsetParent !== null && e.textContent + e.id), box = (id) => byId(id).getBoundingClientRect();
   const meet = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
-  const pairs = [["panel", "menu"], ["panel", "compare"], ["compare", "menu"]];
+  const pairs = [["panel", "menu"], ["panel", "canvas"], ["panel", "compare"], ["compare", "menu"]];
   return {
     outside: seen.map((e) => [e.id || e.textContent, e.getBoundingClientRect()])
       .filter(([, { left, right }]) => left < 0 || right > innerWidth),
     overlap: pairs.filter(([a, b]) => meet(box(a), box(b))),
     scrolls: document.documentElement.scrollWidth > innerWidth || byId("panel").scrollWidth > byId("panel").clientWidth,
-    scene: box("canvas").width * box("canvas").height / (innerWidth * innerHeight),
+    scene: box("canvas").width * box("canvas").height > 0.5 * innerWidth * innerHeight,
+    slider: byId("photo-share").offsetWidth >= 100,
   };
 }"""
 
@@ -224,7 +239,7 @@ def test_controls_fit_screens_of_any_size(ball: Viewer, size: tuple[int, int]):
     ball.run("() => { if (byId('panel').hidden) byId('menu').click(); }")
     ball.run("document.querySelectorAll('details').forEach((each) => (each.open = true))")
     ball.run("viewer.photo = 0; viewer.changed()")
-    assert ball.run(LAYOUT) == {"outside": [], "overlap": [], "scrolls": False, "scene": 1}
+    assert ball.run(LAYOUT) == {"outside": [], "overlap": [], "scrolls": False, "scene": True, "slider": True}
     ball.run("document.querySelectorAll('details').forEach((each) => (each.open = false))")
     ball.run("viewer.leavePhoto(); byId('menu').click()")
     ball.page.set_viewport_size({"width": 120, "height": 90})
@@ -283,21 +298,31 @@ def test_a_click_on_a_camera_shows_its_photo(ball: Viewer):
     assert ball.run("document.getElementById('photo').hidden")
 
 
-def test_a_measured_length_is_that_of_the_scene(ball: Viewer):
-    """Two pixels of the same picture and the Python renderer's camera: the length follows from the two distances."""
-    pick = """() => { const c = viewer.canvas; viewer.measured = [];
-      const found = []; for (let y = 8; y < c.height; y += 8) for (let x = 4; x < c.width; x += 8) {
-        const point = viewer.pointAt(x, y); if (point) found.push([x, y, point]); }
-      return found; }"""
-    found = ball.run(pick)
-    (x, y, first), (u, v, last) = found[0], found[-1]
-    ball.run("([x, y, u, v]) => { viewer.measure(x, y); viewer.measure(u, v); }", [x, y, u, v])
-    length = ball.run("viewer.distance()")
-    assert length["unit"] == "scene units" and length["value"] == pytest.approx(
-        np.linalg.norm(np.subtract(first, last))
-    )
-    assert 0.1 < length["value"] < 4
-    ball.run("viewer.measured = []")
+def test_measured_lengths_are_right_to_1_percent(browser: Any, tmp_path: Path):
+    """Between points of a solid cube that are clicked, in metres."""
+    field = made(tmp_path, "box")
+    write_json(field.inputs["scale"] / "scale.json", {"metres_per_unit": 0.25})
+    save_field(field.inputs["train"], solid_cube(), {"background": [1.0] * 3, "downscale": 1.0, "effects": {}})
+    (tmp_path / "viewer").mkdir()
+    run_stage(viewer, viewer.Config(bits="8", mesh="off"), field.inputs, tmp_path / "viewer", RecordedProgress())
+    page = Viewer(browser, tmp_path / "viewer/viewer.html", 320, 240)
+    page.run("document.querySelector('#measure > summary').click()")
+    pose = page.run("viewer.navigation.pose")
+    lens = page.run("Object.values(fitted(viewer.lens, 320, 240)).toSpliced(2, 1)")  # no scale
+    rows = np.array([*np.reshape(pose["rotation"], (3, 3)), pose["centre"]]).T
+    rays = pinhole_rays(rows, lens, (0.0, 9.0))
+    entry = ((-CUBE * rays.directions.sign() - rays.origins) / rays.directions).amax(-1)
+    surface = (rays.origins + entry[..., None] * rays.directions).numpy()
+    clicks = [(x, y) for y in range(4, 240, 8) for x in range(4, 240, 8) if np.abs(surface[y, x]).max() < CUBE + 1e-3]
+    ends, lengths = [(clicks[0], clicks[-1]), (clicks[len(clicks) // 3], clicks[len(clicks) // 2])], []
+    for pair in ends:
+        for x, y in pair:
+            page.page.mouse.click(x + 0.5, y + 0.5)
+        value, unit = page.run("byId('distance').textContent").split()
+        lengths.append(np.linalg.norm(surface[pair[0][::-1]] - surface[pair[1][::-1]]))
+        assert unit == "m" and float(value) == pytest.approx(0.25 * lengths[-1], rel=0.01)
+    assert min(lengths) > 0.1 and max(lengths) > 0.8 and page.faults == []
+    page.close()
 
 
 def test_a_saved_path_is_read_back_by_render(ball: Viewer, tmp_path: Path):

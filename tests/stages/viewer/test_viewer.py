@@ -4,6 +4,8 @@ import base64
 import gzip
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from nerf.kernels import grid_layout
 from stages import viewer
 from stages.contract import run_stage
 from stages.io.field_files import save_field
+from stages.io.files import read_json, write_json
 from stages.viewer import contents
 from stages.viewer.contents import photo_side
 from stages.viewer.tables import quantised, sections, with_table
@@ -154,3 +157,20 @@ def test_a_vanilla_nerf_has_a_page_that_says_why_not(tmp_path: Path):
 def test_small_photos_of_a_large_set_are_smaller():
     assert photo_side(8) == 320 and photo_side(10_000) == 96
     assert 96 < photo_side(200) < 320
+
+
+def test_a_live_page_needs_neither_warp_nor_mesh_libraries(tmp_path: Path):
+    """They take seconds to load, on cores that train many."""
+    field = made(tmp_path, "box")
+    write_json(
+        field.inputs["train"] / "field.json", read_json(field.inputs["train"] / "field.json") | {"backend": "warp"}
+    )
+    program = f"""if True:
+        import sys
+        from pathlib import Path
+        from stages.viewer.live import LiveContents
+        inputs = {{name: Path(folder) for name, folder in {[(n, str(f)) for n, f in field.inputs.items()]}}}
+        assert LiveContents(inputs).field_contents(inputs["train"]).header["field"]["bits"] == 16
+        print([name for name in ("scipy.spatial", "trimesh", "warp") if name in sys.modules])"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
