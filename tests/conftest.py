@@ -2,7 +2,9 @@
 
 import functools
 import gc
+import os
 import pkgutil
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,10 @@ import pytest
 import torch
 from hypothesis import settings
 from jaxtyping import config, install_import_hook
+
+# Tests start hundreds of programs of ours, and none has to compile our source anew, whatever the environment says.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # Every module by its name, and so none of nerf.kernels.warp: kernels are compiled from their source, undecorated.
 NERF = Path(__file__).parents[1] / "nerf"
@@ -25,6 +31,12 @@ torch.set_num_threads(1)
 # A slow machine is no failure.
 settings.register_profile("default", deadline=None)
 settings.load_profile("default")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """One more than there are cores: a fifth of the time of tests is waiting, for programs and browsers they start."""
+    return (os.cpu_count() or 1) + 1
 
 
 def pytest_collection_finish() -> None:

@@ -90,7 +90,8 @@ def _photo(
     if not effects.alpha:
         return pixels
     matrix = torch.tensor(pose, dtype=torch.float32)
-    hit = world.trace(_rays(pinhole_directions(WIDTH, HEIGHT, FOCAL), matrix)).hit
+    rays = _rays(pinhole_directions(WIDTH, HEIGHT, FOCAL), matrix)
+    hit = world.intersect(rays.origins, rays.directions).isfinite().any(0)
     return np.concatenate([pixels, 255 * hit.numpy()[..., None].astype(np.uint8)], axis=2)
 
 
@@ -112,8 +113,8 @@ def _tracks(world: SyntheticScene, poses: np.ndarray, random: np.random.Generato
         towards = torch.tensor(points[chosen] - pose[:, 3], dtype=torch.float32)
         distance = towards.norm(dim=-1)
         origin = torch.tensor(pose[:, 3], dtype=torch.float32).expand_as(towards)
-        trace = world.trace(Rays(origin, towards / distance[:, None], 0 * distance, distance + math.inf))
-        chosen = chosen[((trace.depth - distance).abs() < 5e-3).numpy()]
+        depth = world.intersect(origin, towards / distance[:, None]).amin(0)
+        chosen = chosen[((depth - distance).abs() < 5e-3).numpy()]
         noisy = xy[chosen] + TRACK_NOISE_PX * random.normal(size=(len(chosen), 2))
         seen.append((np.full(len(chosen), number), chosen, noisy))
     view, point, xy = (np.concatenate(column) for column in zip(*seen, strict=True))

@@ -118,6 +118,8 @@ def offenders(pattern: str, sources: dict[str, str]) -> list[str]:
     """``file:line: text`` of each line, and ``file`` of each path, in which the pattern is found."""
     found = [name for name in sources if re.search(pattern, name)]
     for name, text in sources.items():
+        if not re.search(pattern, text):  # many times as fast as line by line
+            continue
         for number, line in enumerate(text.splitlines(), 1):
             if re.search(pattern, line):
                 found.append(f"{name}:{number}: {line.strip()}")

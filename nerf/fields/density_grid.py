@@ -60,7 +60,9 @@ def sample_density_grid(
 
     def density(start: int) -> Tensor:
         index = torch.arange(start, min(start + chunk, total), device=low.device)
-        i, j, k = torch.unravel_index(index, counts)
+        # Not torch.unravel_index: its first call imports sympy, for most of a second.
+        column, k = index // counts[2], index % counts[2]
+        i, j = column // counts[1], column % counts[1]
         with torch.no_grad():  # a property of the thread
             return field.density(torch.stack([axes[0][i], axes[1][j], axes[2][k]], dim=-1)).float()
 

@@ -63,6 +63,8 @@ def test_a_long_box_has_nearly_cubic_voxels():
     grid = sample_density_grid(Field(linear), 41, LOW, torch.tensor([0.9, 0.0, -0.75]))
     assert grid.values.shape == (41, 21, 4)
     assert float(grid.spacing().max() / grid.spacing().min()) < 1.2
+    index = torch.cartesian_prod(*(torch.arange(count) for count in grid.values.shape))
+    torch.testing.assert_close(grid.values.flatten(), linear(LOW + index * grid.spacing()))
 
 
 def test_the_chunk_size_changes_nothing_and_progress_is_told():

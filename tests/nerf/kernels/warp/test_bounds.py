@@ -15,7 +15,8 @@ TESTS = [
     *(f"tests/nerf/kernels/warp/test_{name}.py" for name in ("warp", "marching", "compositing", "threads")),
     *(f"tests/nerf/kernels/test_{name}.py" for name in ("early_termination", "colour_sampling")),
 ]
-TESTED = f"import pytest; raise SystemExit(pytest.main({TESTS} + ['-k', 'not first_use', '-p', 'no:cacheprovider']))"
+OPTIONS = ["-n", "0", "-k", "not first_use", "-p", "no:cacheprovider"]  # workers would not be in debug mode
+TESTED = f"import pytest; raise SystemExit(pytest.main({TESTS + OPTIONS}))"
 BEYOND = """
 import torch
 from nerf.kernels import warp
