@@ -14,7 +14,7 @@ from stages.contract import READING_SECONDS, Inputs, Progress, StageConfig, Stag
 from stages.io.files import write_json
 
 INPUTS = ("ingest", "sfm", "normalise", "scale", "effects", "train", "evaluate", "render", "mesh", "viewer", "tradeoff")
-VERSION = 16
+VERSION = 17
 EXIT_CODE = 18
 RESUMES = False
 SUMMARY = True
