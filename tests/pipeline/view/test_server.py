@@ -345,6 +345,21 @@ def test_ctrl_c_ends_the_command_and_leaves_the_training_alone(tmp_path: Path) -
         assert training.thread.is_alive(), training.error
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only there it can be seen what a program has loaded")
+def test_sigterm_ends_the_command_without_a_crash_report(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "pipeline", "view", str(RunningTraining(tmp_path).root), "--json"]
+    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    command = subprocess.Popen(words, env=quiet_environment(), **pipes)
+    ends = time.monotonic() + WAIT_SECONDS
+    while "pycolmap" not in Path(f"/proc/{command.pid}/maps").read_text():
+        assert time.monotonic() < ends
+        time.sleep(0.1)
+    time.sleep(2)  # it brings a handler of its own
+    command.terminate()
+    _, said = command.communicate(timeout=WAIT_SECONDS)
+    assert command.returncode == 143 and "Traceback" not in said and "@ " not in said
+
+
 def test_a_server_during_a_run_ends_with_it(tmp_path: Path) -> None:
     lines = (
         "import time",
