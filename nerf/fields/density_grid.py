@@ -40,21 +40,23 @@ class DensityGrid(NamedTuple):
 
 def sample_density_grid(
     field: DensityField,
-    resolution: int,
+    resolution: int | tuple[int, int, int],
     low: Float[Tensor, "3"],
     high: Float[Tensor, "3"],
     chunk: int = 1 << 16,
     on_chunk: Callable[[float], None] = lambda done: None,
 ) -> DensityGrid:
-    """Sample the density with ``resolution`` vertices along the longest edge and nearly cubic voxels.
+    """Sample the density with ``resolution`` vertices along the longest edge and nearly cubic voxels, or with so many
+    along each edge.
 
     Points go to the field in chunks of fixed size, so the result does not depend on threads; ``on_chunk`` hears
     the finished share after each. Raises ValueError for an empty box or fewer than two vertices along an edge.
     """
     edges = high - low
-    if resolution < 2 or not bool((edges > 0).all()):
+    least = min(resolution) if isinstance(resolution, tuple) else resolution
+    if least < 2 or not bool((edges > 0).all()):
         raise ValueError(f"a grid needs a box and two vertices per edge, got {edges.tolist()} and {resolution}")
-    counts = [max(2, round(float(edge / edges.max()) * (resolution - 1)) + 1) for edge in edges]
+    counts = resolution if isinstance(resolution, tuple) else _nearly_cubic(edges, resolution)
     axes = [torch.linspace(float(a), float(b), n, device=low.device) for a, b, n in zip(low, high, counts, strict=True)]
     total = math.prod(counts)
 
@@ -71,6 +73,12 @@ def sample_density_grid(
         values[number * chunk : (number + 1) * chunk] = part
         on_chunk(min((number + 1) * chunk, total) / total)
     return DensityGrid(values.reshape(counts), low, high)
+
+
+def _nearly_cubic(edges: Float[Tensor, "3"], resolution: int) -> tuple[int, int, int]:
+    """Vertices along the edges of a box, ``resolution`` along the longest."""
+    x, y, z = (max(2, round(float(edge / edges.max()) * (resolution - 1)) + 1) for edge in edges)
+    return x, y, z
 
 
 def occupancy(grid: DensityGrid, level: float) -> DensityGrid:

@@ -177,17 +177,25 @@ def _covers(label: np.ndarray, area: np.ndarray, marked: np.ndarray, fraction: f
     return np.bincount(label, area * marked) >= fraction * np.bincount(label, area)
 
 
-def boundary(surface: Surface, box: np.ndarray, voxel_size: VoxelSize, cropped: bool = False) -> str:
-    """Where the surface ends: "watertight", or "open" and where, for a grid over a box (2, 3) of its space. Of one that
-    was ``cropped`` it is not known which border is the crop's."""
+def boundary(
+    surface: Surface, ends: tuple[np.ndarray, np.ndarray], voxel_size: VoxelSize, cropped: bool = False
+) -> str:
+    """Where the surface ends: "watertight", or "open" and where. ``ends``: the region of the scene that is meshed, and
+    the grid's box in its space (2, 3 each). Of one that was ``cropped`` it is not known which border is the crop's."""
     if is_watertight(surface):
         return "watertight"
-    border = voxel_size.space.forward(torch.from_numpy(border_vertices(surface))).numpy()
+    border = border_vertices(surface)
     if len(border) == 0:
         return "closed, but not a manifold"
     if cropped:
         return "open, cropped by --mesh.box"
-    half = voxel_size.spacing / 2
-    at_box = ((border < box[0] + half) | (border > box[1] - half)).any(axis=1)
+    (region, box), mapped = ends, voxel_size.space.forward(torch.from_numpy(border)).numpy()
+    reach = np.maximum(*voxel_size.at(border))[:, None]
+    at_box = _next_to(region, border, reach / 2) | _next_to(box, mapped, voxel_size.spacing.max() / 2)
     places = [("at the edge of the region", at_box.any()), ("where too few photos see it", not at_box.all())]
     return "open " + " and ".join(place for place, present in places if present)
+
+
+def _next_to(box: np.ndarray, points: np.ndarray, reach: np.ndarray | float) -> np.ndarray:
+    """Which points (n, 3) lie within ``reach`` of a side of a box (2, 3), or beyond it."""
+    return ((points < box[0] + reach) | (points > box[1] - reach)).any(axis=1)

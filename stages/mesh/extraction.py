@@ -21,12 +21,20 @@ from stages.io.files import SMALL_COPY, read_scene, read_tensors, write_png, wri
 from stages.mesh.cleaning import Cleaned, boundary, clean
 from stages.mesh.decimation import decimate
 from stages.mesh.files import WRITERS, Z_UP_TO_Y_UP, ColouredMesh
-from stages.mesh.grid_space import DensityIn, VoxelSize, grid_space, in_scene
+from stages.mesh.grid_space import (
+    DensityIn,
+    VoxelLengths,
+    VoxelSize,
+    box_in,
+    grid_space,
+    in_scene,
+    points_of_grid,
+)
 from stages.mesh.holes import Closed, close_holes
 from stages.mesh.iso_level import DIVERGED_HINT, IsoLevel, check_range, choose_iso_level
 from stages.mesh.marching_cubes import extract_surface
 from stages.mesh.preview import preview, small_copy
-from stages.mesh.resolution import CHUNK, grid_box, point_cost, points_per_edge, slab_factor
+from stages.mesh.resolution import CHUNK, grid_box, point_cost, slab_factor
 from stages.mesh.surface import Surface, face_areas, is_watertight, keep_faces, vertex_normals
 from stages.mesh.texture.texturing import Textured, texture_of
 from stages.mesh.visibility import ShadowMap, sample_rays, shadow_maps, vertex_visibility
@@ -96,17 +104,18 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     """The mesh of the field; ``config`` must be planned. Raises StageError without a surface."""
     space = grid_space(source.space)
     field = DensityIn(space, source.model)
-    box = grid_box(source.scene.capture_type, source.points, space)
-    grid = _density_grid(config, field, box, source.device, progress)
-    voxel_size = VoxelSize(space, float(grid.spacing().max()))
+    region = grid_box(source.scene.capture_type, source.points)
+    box = box_in(space, region)
+    grid = _density_grid(config, field, region, source, progress)
+    voxel_size = VoxelSize(space, grid.spacing().cpu().numpy())
     views = source.scene.of_split("train")
     maps = shadow_maps(
         grid, space, source.scene, source.ingest, views, lambda done: progress.update("visibility", 0.4 + 0.1 * done)
     )
     iso_level = _iso_level(config, grid, field, maps, progress)
     progress.update("marching cubes", 0.5)
-    raw = in_scene(extract_surface(grid, iso_level.density), space)
-    visibility = vertex_visibility(raw.vertices, vertex_normals(raw), maps, voxel_size.at(raw.vertices))
+    raw = in_scene(extract_surface(grid, iso_level.density), space, region)
+    visibility = vertex_visibility(raw.vertices, vertex_normals(raw), maps, voxel_size.at(raw.vertices).along)
     progress.update("cleaning", 0.55)
     min_views = min(config.min_views, len(views))
     cleaned = clean(
@@ -114,7 +123,7 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     )
     cropped = _cropped(config, cleaned.surface, source)
     surface = decimate(cropped, config.max_faces or default_faces(config, len(cropped.faces)), source.space)
-    ends = boundary(surface, box, voxel_size, cropped=len(cropped.faces) < len(cleaned.surface.faces))
+    ends = boundary(surface, (region, box), voxel_size, cropped=len(cropped.faces) < len(cleaned.surface.faces))
     if config.close:
         surface, closed = close_holes(surface, config.close)
         ends = "watertight" if is_watertight(surface) else ends
@@ -123,11 +132,11 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     progress.update("colours", 0.6)
     nearest = KDTree(cleaned.surface.vertices).query(surface.vertices)[1]
     directions, of_raw = visibility.direction[cleaned.vertex[nearest]], cleaned.surface.vertices[nearest]
-    colours = vertex_colours(source.model, of_raw, directions, voxel_size.at(of_raw), source.device)
+    colours = vertex_colours(source.model, of_raw, directions, voxel_size.at(of_raw).along, source.device)
     voxels = voxel_size.at(surface.vertices)
     textured = _textured(config, surface, colours, source, voxels, progress)
     mesh = ColouredMesh(*surface, vertex_normals(surface), colours, textured and textured.texture)
-    return Extracted(mesh, iso_level, cleaned, closed, ends, float(np.median(voxels)), textured)
+    return Extracted(mesh, iso_level, cleaned, closed, ends, float(np.median(voxels.along)), textured)
 
 
 def default_faces(config: "Config", found: int) -> int:
@@ -154,7 +163,7 @@ def _cropped(config: "Config", surface: Surface, source: Source) -> Surface:
 
 
 def _textured(
-    config: "Config", surface: Surface, colours: np.ndarray, source: Source, voxels: np.ndarray, progress: Progress
+    config: "Config", surface: Surface, colours: np.ndarray, source: Source, voxels: VoxelLengths, progress: Progress
 ) -> Textured | None:
     """The texture asked for; None for one colour per vertex."""
     if config.texture_size == 0:
@@ -171,19 +180,23 @@ def _textured(
     return textured
 
 
-def _density_grid(config: "Config", field: DensityIn, box: np.ndarray, device: str, progress: Progress) -> DensityGrid:
+def _density_grid(
+    config: "Config", field: DensityIn, region: np.ndarray, source: Source, progress: Progress
+) -> DensityGrid:
     assert config.resolution is not None
-    bytes_per_point = BYTES_PER_POINT * point_cost(slab_factor(box))
+    bytes_per_point = BYTES_PER_POINT * point_cost(slab_factor(region))
     fits = int((available_bytes() / bytes_per_point) ** (1 / 3)) // 16 * 16
     hint = f"Try --mesh.resolution {fits}." if fits >= 16 else "Close other programs."
     needed = bytes_per_point * config.resolution**3
     check_memory(needed, "the mesh", f"a density grid of {config.resolution}³ points needs", hint)
-    low, high = torch.tensor(box, dtype=torch.float32, device=device)
+    box = box_in(field.space, region)
+    low, high = torch.tensor(box, dtype=torch.float32, device=source.device)
+    counts = points_of_grid(field.space, box, config.resolution, source.points)
 
     def report(done: float) -> None:
         progress.update(f"density at {config.resolution}³ points", 0.4 * done)
 
-    return sample_density_grid(field, points_per_edge(box, config.resolution), low, high, CHUNK, report)
+    return sample_density_grid(field, counts, low, high, CHUNK, report)
 
 
 def _iso_level(
@@ -289,6 +302,7 @@ def _facts(config: "Config", extracted: Extracted, source: Source) -> dict[str, 
         "surface_error_voxels": iso_level.surface_error_voxels,
         "resolution": config.resolution,
         "voxel": extracted.voxel * unit,
+        "grid_space": grid_space(source.space).kind,
         "surface_area": float(face_areas(Surface(mesh.vertices, mesh.faces)).sum()) * unit**2,
         "frame": config.frame,
     }

@@ -32,7 +32,7 @@ DIVERGED_HINT = "Train again with a tenth of --train.learning-rate: the field ha
 
 
 class IsoLevel(NamedTuple):
-    """``density`` of the surface, per scene unit, and why.
+    """``density`` of the surface, per unit length of the grid's space, and why.
 
     ``surface_error_voxels`` is the mean clipped distance of the surface to where rays stop, None where that was not
     measured; ``well_defined`` says whether photos and surface agree.
@@ -58,13 +58,13 @@ def check_range(grid: DensityGrid, iso_level: float | None) -> None:
     low, high = float(grid.values.min()), float(grid.values.max())
     opacity = 1 - float(torch.exp(-high * (grid.high - grid.low).norm()))
     if opacity < 0.01:
-        why = f"its density is at most {high:.3g} per scene unit: a ray across the box has an opacity of {opacity:.1%}"
+        why = f"its density is at most {high:.3g}: a ray across the box has an opacity of {opacity:.1%}"
         raise StageError("mesh.empty-field", "the field is empty", why, RETRAIN)
     if high - low < 1e-3 * high:
-        why = f"its density is {low:.3g} to {high:.3g} per scene unit, the same everywhere"
+        why = f"its density is {low:.3g} to {high:.3g}, the same everywhere"
         raise StageError("mesh.uniform-field", "the field has no surface", why, RETRAIN)
     if iso_level is not None and not low < iso_level < high:
-        why = f"density runs from {low:.3g} to {high:.3g} per scene unit"
+        why = f"density runs from {low:.3g} to {high:.3g}"
         hint = "Give --mesh.iso-level a value in between, or leave it out for the default."
         raise StageError("mesh.level-out-of-range", f"no surface at density {iso_level:g}", why, hint)
 

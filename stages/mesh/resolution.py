@@ -19,7 +19,7 @@ from stages.contract import Inputs, Progress
 from stages.hardware.device import compute_device
 from stages.io.field_files import load_field
 from stages.io.files import read_json, read_scene, read_tensors
-from stages.mesh.grid_space import DensityIn, GridSpace, box_in, grid_space
+from stages.mesh.grid_space import DensityIn, GridSpace, box_in, grid_space, points_of_grid
 from stages.mesh.marching_cubes import extract_surface
 from stages.mesh.surface import vertex_normals
 
@@ -59,9 +59,9 @@ def choose_resolution(seconds: float | None, inputs: Inputs, progress: Progress)
     began = time.perf_counter()
     points = read_tensors(inputs["normalise"] / "points.safetensors")["xyz"].astype(float)
     space = grid_space(space_map(**read_json(inputs["train"] / "field.json")["settings"]["space"]))
-    box = grid_box(read_scene(inputs["normalise"]).capture_type, points, space)
-    query, reference = density_query_seconds(inputs["train"], space, box), reference_seconds()
-    return resolution_within(seconds - (time.perf_counter() - began), query, reference, slab_factor(box))
+    region = grid_box(read_scene(inputs["normalise"]).capture_type, points)
+    query, reference = density_query_seconds(inputs["train"], space, box_in(space, region)), reference_seconds()
+    return resolution_within(seconds - (time.perf_counter() - began), query, reference, slab_factor(region))
 
 
 def resolution_from_training(rays: int) -> int:
@@ -70,9 +70,9 @@ def resolution_from_training(rays: int) -> int:
     return min(MAX_RESOLUTION, max(MIN_TRAINED_RESOLUTION, round(edge / 16) * 16))
 
 
-def grid_box(capture_type: CaptureType, points: np.ndarray, space: GridSpace) -> np.ndarray:
-    """The box of the density grid in its ``space``: around the region of interest, or where the scene is flat (ground
-    from the air, a façade, the floor of a house) the slab of it that sparse ``points`` (n, 3) of the scene lie in.
+def grid_box(capture_type: CaptureType, points: np.ndarray) -> np.ndarray:
+    """The box of the scene that is meshed: the region of interest, or where the scene is flat (ground from the air, a
+    façade, the floor of a house) the slab of it that sparse ``points`` (n, 3) lie in.
 
     Never a slab where photos were taken around an object: its top may be bare, and points on what it stands on do not
     tell how far it reaches.
@@ -80,19 +80,13 @@ def grid_box(capture_type: CaptureType, points: np.ndarray, space: GridSpace) ->
     cube = np.array([[-REGION_HALF_SIZE] * 3, [REGION_HALF_SIZE] * 3])
     points = points[(np.abs(points) <= REGION_HALF_SIZE).all(axis=1)]
     if capture_type == "object-centric" or len(points) < MIN_POINTS:
-        return box_in(space, cube)
+        return cube
     low, high = np.quantile(points, [QUANTILE, 1 - QUANTILE], axis=0)
     flat, side = int((high - low).argmin()), 2 * REGION_HALF_SIZE
     bottom, top = low[flat] - MARGIN * side, high[flat] + MARGIN * side
     if (high - low).max() >= WIDE * side >= top - bottom:
         cube[:, flat] = max(bottom, -REGION_HALF_SIZE), min(top, REGION_HALF_SIZE)
-    return box_in(space, cube)
-
-
-def points_per_edge(box: np.ndarray, resolution: int) -> int:
-    """Grid points along the longest edge of a box."""
-    sides = (box[1] - box[0]).tolist()
-    return round((resolution - 1) * max(sides) / math.prod(sides) ** (1 / 3)) + 1
+    return cube
 
 
 def slab_factor(box: np.ndarray) -> float:
@@ -128,13 +122,14 @@ def density_query_seconds(train: Path, space: GridSpace, box: np.ndarray) -> flo
     model, _ = load_field(train, device)
     field = DensityIn(space, model)
     low, high = torch.tensor(box, dtype=torch.float32, device=device)
-    sample_density_grid(field, TIMED_EDGES[0], low, high, CHUNK)  # the first pays for memory and kernels
+    sample_density_grid(field, 3 * (TIMED_EDGES[0],), low, high, CHUNK)  # the first pays for memory and kernels
     seconds = per_point = 0.0
     for edge in TIMED_EDGES:
         if seconds >= MIN_TIMED_SECONDS:
             break
         began = time.perf_counter()
-        count = sample_density_grid(field, points_per_edge(box, edge), low, high, CHUNK).values.cpu().numel()
+        counts = points_of_grid(space, box, edge, np.zeros((0, 3)))
+        count = sample_density_grid(field, counts, low, high, CHUNK).values.cpu().numel()
         seconds = time.perf_counter() - began
         per_point = seconds / count
     return per_point

@@ -12,7 +12,6 @@ steps grow with the distance. Densities are per scene unit in all of them.
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -39,10 +38,6 @@ class Box:
     def inverse(self, mapped: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         """The scene points again."""
         return mapped
-
-    def scene_length(self, mapped: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
-        """Length in the scene for a length in the box."""
-        return torch.ones_like(mapped[..., 0])
 
     def map_rays(self, rays: Rays) -> MappedRays:
         """Rays as they are marched."""

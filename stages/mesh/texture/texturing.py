@@ -8,6 +8,7 @@ import numpy as np
 
 from nerf.geometry.scene import Scene
 from stages.hardware.memory import check_memory
+from stages.mesh.grid_space import VoxelLengths
 from stages.mesh.surface import Surface
 from stages.mesh.texture.atlas import Texture, make_atlas
 from stages.mesh.texture.baking import bake
@@ -34,13 +35,13 @@ def texture_of(
     scene: Scene,
     ingest: Path,
     field: dict[str, Any],
-    voxels: np.ndarray,
+    voxels: VoxelLengths,
     max_size: int,
     report: Callable[[str, float], None],
 ) -> Textured | None:
     """The texture of a surface in the scene frame, at most ``max_size`` texels a side. ``field_colours`` (n, 3) sRGB
-    uint8 of the vertices hold where no photo sees them; ``field``: the content of field.json; ``voxels`` (n,): how well
-    the surface is known where. None where no photo sees any of the surface. Raises StageError where that is too small,
+    uint8 of the vertices hold where no photo sees them; ``field``: the content of field.json; ``voxels``: how well the
+    surface is known where. None where no photo sees any of the surface. Raises StageError where that is too small,
     too large for the memory, or a photo is gone."""
     photos, means = photos_of(scene, ingest, field), neighbour_means(surface)
     candidates = find_candidates(

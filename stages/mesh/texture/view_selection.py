@@ -15,6 +15,7 @@ from scipy.ndimage import minimum_filter
 from scipy.sparse import csr_array
 
 from nerf.runtime.parallel import in_order
+from stages.mesh.grid_space import VoxelLengths
 from stages.mesh.rasteriser import nearest_faces
 from stages.mesh.surface import Surface, face_area_vectors, vertex_normals
 from stages.mesh.texture.photos import Photo, Picture, Projection, colours_at, projected, read_picture, used_at
@@ -93,9 +94,9 @@ def neighbour_means(surface: Surface) -> csr_array:
 
 
 def find_candidates(
-    surface: Surface, photos: Sequence[Photo], means: csr_array, voxels: np.ndarray, on_photo: Callable[[float], None]
+    surface: Surface, photos: Sequence[Photo], means: csr_array, voxels: VoxelLengths, on_photo: Callable[[float], None]
 ) -> Candidates:
-    """The best photos of every vertex. ``voxels`` (n,): how well it is known where, in its unit of length."""
+    """The best photos of every vertex. ``voxels``: how well it is known where."""
     count, slots = len(surface.vertices), min(KEPT_PHOTOS, len(photos))
     kept = Candidates(
         np.zeros((count, slots), np.int32),
@@ -127,7 +128,7 @@ def find_candidates(
 
 
 def _pixels(
-    surface: Surface, normals: np.ndarray, photo: Photo, place: Projection, voxels: np.ndarray
+    surface: Surface, normals: np.ndarray, photo: Photo, place: Projection, voxels: VoxelLengths
 ) -> tuple[np.ndarray, np.ndarray]:
     """How finely a photo shows each vertex, its sharp pixels per unit of area, 0 where it does not see it; and what
     each of these counts: less towards the photo's borders and next to silhouettes. Both (n,) float32."""
@@ -144,7 +145,7 @@ def _pixels(
 
 
 def _visible(
-    surface: Surface, photo: Photo, place: Projection, cosine: np.ndarray, voxels: np.ndarray
+    surface: Surface, photo: Photo, place: Projection, cosine: np.ndarray, voxels: VoxelLengths
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which vertices nothing hides, and which of these are next to the silhouette of what lies before them."""
     shrink = max(photo.camera.width, photo.camera.height) / MAX_MAP_SIDE
@@ -157,14 +158,14 @@ def _visible(
         depth = 1 / nearness  # infinite where there is nothing
     focal = photo.focal_px * width / photo.camera.width
     seen = place.inside & ahead
-    known = float(np.median(voxels[seen] / place.depth[seen])) if seen.any() else 0.0
+    known = float(np.median(voxels.across[seen] / place.depth[seen])) if seen.any() else 0.0
     margin = int(np.clip(np.ceil(MARGIN_VOXELS * focal * known), 1, MAX_MARGIN_PX))
     column, row = np.clip(pixels.astype(np.int64), 0, [width - 1, height - 1]).T
     tangent = np.sqrt(1 / np.maximum(cosine, MIN_COSINE) ** 2 - 1).clip(max=MAX_TANGENT)
     hidden = []
     for reach in (1, margin + 1):
         before = minimum_filter(depth, size=2 * reach + 1, mode="nearest")[row, column]
-        slack = DEPTH_BIAS_VOXELS * voxels + (reach + 0.5) * tangent * place.depth / focal
+        slack = DEPTH_BIAS_VOXELS * voxels.along + (reach + 0.5) * tangent * place.depth / focal
         hidden.append(place.depth > before + slack)
     return ~hidden[0], hidden[1]
 

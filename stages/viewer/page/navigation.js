@@ -9,11 +9,11 @@ const MIN_DISTANCE = 1e-3;
 const STEEPEST = 0.995; // cosine between view and up: an orbit ends before it tips over
 const HELD = new Set(["w", "a", "s", "d", "q", "e", "arrowleft", "arrowright", "arrowup", "arrowdown", "+", "=", "-"]);
 
-/** Whether a key is for the scene: not where it is typed or moves a slider. */
+/** Whether a key is for the scene: not where it is typed, moves a slider or presses a button. */
 function isForScene({ target, key, ctrlKey, metaKey, altKey }) {
-  if (ctrlKey || metaKey || altKey) return false;
-  const takesLetters = target.matches("select, [type=number]"), takesOthers = target.matches("button, summary, input");
-  return !takesLetters && !(takesOthers && (key.length > 1 || key === " "));
+  if (ctrlKey || metaKey || altKey || target.matches("select, [type=number]")) return false;
+  const moves = key.startsWith("Arrow") && target.matches("[type=range], [type=radio]");
+  return !moves && !((key === "Enter" || key === " ") && target.matches("button, summary, input"));
 }
 
 class Navigation {
@@ -26,7 +26,7 @@ class Navigation {
     canvas.addEventListener("wheel", (event) => this.wheeled(event), { passive: false });
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     document.addEventListener("keydown", (event) => this.keyed(event));
-    document.addEventListener("keyup", (event) => this.held.delete(event.key.toLowerCase()));
+    document.addEventListener("keyup", (event) => this.keyReleased(event));
     window.addEventListener("blur", () => this.held.clear());
   }
 
@@ -98,6 +98,12 @@ class Navigation {
     if (yaw || pitch) this.orbit(-turn * yaw, turn * pitch);
     const nearer = down("+") + down("=") - down("-");
     if (nearer) this.zoom(Math.exp(-nearer * seconds));
+  }
+
+  /** A key held with Shift has another name without it, and none is told of where it was held with Meta. */
+  keyReleased({ key }) {
+    if (key === "Shift" || key === "Meta") this.held.clear();
+    this.held.delete(key.toLowerCase());
   }
 
   pressed(event) {

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -350,11 +351,12 @@ def test_sigterm_ends_the_command_without_a_crash_report(tmp_path: Path) -> None
     words = [sys.executable, "-m", "pipeline", "view", str(RunningTraining(tmp_path).root), "--json"]
     pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     command = subprocess.Popen(words, env=quiet_environment(), **pipes)
-    ends = time.monotonic() + WAIT_SECONDS
+    assert command.stdout is not None
+    url, ends = json.loads(command.stdout.readline())["url"], time.monotonic() + WAIT_SECONDS
     while "pycolmap" not in Path(f"/proc/{command.pid}/maps").read_text():
         assert time.monotonic() < ends
         time.sleep(0.1)
-    time.sleep(2)  # it brings a handler of its own
+    urllib.request.urlopen(f"{url}state", timeout=WAIT_SECONDS).close()  # its import has ended
     command.terminate()
     _, said = command.communicate(timeout=WAIT_SECONDS)
     assert command.returncode == 143 and "Traceback" not in said and "@ " not in said

@@ -14,6 +14,8 @@ from tests.refusals import refused
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
 
+CUBE = np.array([[-0.9] * 3, [0.9] * 3])
+
 
 def tetrahedra(*sizes):
     """Separate tetrahedra of the given edge lengths in a row."""
@@ -179,4 +181,4 @@ def sheet(low, high):
     ],
 )
 def test_the_end_of_a_surface_is_named(surface, words):
-    assert boundary(surface, np.array([[-0.9] * 3, [0.9] * 3]), VoxelSize(Box(), 0.02)) == words
+    assert boundary(surface, (CUBE, CUBE), VoxelSize(Box(), np.full(3, 0.02))) == words

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
@@ -11,9 +12,11 @@ from nerf.fields.density_grid import median_depth, sample_density_grid
 from nerf.geometry.rays import Rays
 from nerf.geometry.space_maps import Box, Contraction
 from nerf.geometry.space_maps.ndc import Ndc
-from stages.mesh.grid_space import DensityIn, VoxelSize, box_in, grid_space, in_scene
+from stages.mesh.grid_space import DensityIn, VoxelSize, box_in, grid_space, in_scene, points_of_grid
 from stages.mesh.iso_level import choose_iso_level
 from stages.mesh.marching_cubes import extract_surface
+from stages.mesh.surface import Surface
+from tests.refusals import refused
 
 APEX, NEAR = (0.0, -1.4, 0.0), 0.6
 FORWARD = Ndc(APEX, ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)), (0.7, 0.7), NEAR)  # looks along +y
@@ -59,13 +62,42 @@ def test_the_box_holds_what_the_space_shows_of_the_region() -> None:
 
 def test_voxels_are_as_long_as_the_inverse_map_makes_them() -> None:
     vertices = np.array([[0.1, -0.6, 0.05], [0.0, 0.0, 0.0], [-0.3, 0.8, 0.2]])
-    found = VoxelSize(FORWARD, 0.01).at(vertices)
+    found = VoxelSize(FORWARD, np.array([0.02, 0.03, 0.01])).at(vertices)
     mapped = FORWARD.forward(torch.from_numpy(vertices))
-    towards = torch.tensor([0.0, 0.0, 0.005], dtype=torch.float64)
-    measured = (FORWARD.inverse(mapped + towards) - FORWARD.inverse(mapped - towards)).norm(dim=-1)
-    np.testing.assert_allclose(found, measured.numpy(), rtol=1e-3)
-    assert found[2] > 4 * found[0]
-    np.testing.assert_array_equal(VoxelSize(Box(), 0.01).at(vertices), 0.01)
+    for length, step in ((found.along, (0.0, 0.0, 0.005)), (found.across, (0.0, 0.015, 0.0))):
+        half = torch.tensor(step, dtype=torch.float64)
+        measured = (FORWARD.inverse(mapped + half) - FORWARD.inverse(mapped - half)).norm(dim=-1)
+        np.testing.assert_allclose(length, measured.numpy(), rtol=1e-3)
+    assert found.along[2] > 4 * found.along[0]
+    in_box = VoxelSize(Box(), np.full(3, 0.01)).at(vertices)
+    np.testing.assert_array_equal(in_box, 0.01)
+
+
+def test_voxels_are_cubes_at_the_depth_of_the_points() -> None:
+    ahead = np.array([[0.1, 1.5, 0.0], [0.0, 1.6, 0.2], [0.0, 1.7, 0.0], [0.0, -1.0, 0.0]])
+    points = ahead + np.array(APEX)
+    box = box_in(FORWARD, CUBE)
+    counts = np.array(points_of_grid(FORWARD, box, 128, points))
+    lengths = VoxelSize(FORWARD, (box[1] - box[0]) / (counts - 1)).at(points[1:2])
+    assert lengths.along[0] == pytest.approx(lengths.across[0], rel=0.05)
+    assert counts.prod() == pytest.approx(128**3, rel=0.03)
+    assert points_of_grid(Box(), CUBE, 128, points) == (128, 128, 128)
+    assert min(points_of_grid(FORWARD, box, 64, np.zeros((0, 3)))) > 8
+
+
+def test_a_region_that_no_photo_shows_is_named() -> None:
+    behind = CUBE / 3 - [0, 3, 0]
+    with refused("mesh.region-not-seen"):
+        box_in(FORWARD, behind)
+
+
+def test_what_lies_beyond_the_region_is_left_out() -> None:
+    inside, outside = [[-0.1, 0, 0.3], [0.1, 0, 0.3], [0, 0.1, 0.3]], [[0.8, 0, 0.3], [0.85, 0, 0.3], [0.8, 0.1, 0.3]]
+    mapped = Surface(np.array([*inside, *outside]), np.array([[0, 1, 2], [3, 4, 5]], np.int32))
+    kept = in_scene(mapped, FORWARD, CUBE)
+    assert len(kept.faces) == 1 and np.all(np.abs(kept.vertices) <= REGION_HALF_SIZE)
+    with refused("mesh.nothing-in-region"):
+        in_scene(mapped, FORWARD, CUBE / 10 + [0, 5, 0])
 
 
 def test_rays_stop_where_they_stop_in_the_scene() -> None:
@@ -85,7 +117,7 @@ def found_of_walls(space: Ndc | Box) -> tuple[int, int]:
     field = DensityIn(space, Walls())  # pyright: ignore[reportArgumentType]
     grid = sample_density_grid(field, 96, *torch.tensor(box_in(space, CUBE), dtype=torch.float32))
     level = choose_iso_level(grid, field, space.map_rays(rays_ahead(200)).rays)
-    depth = in_scene(extract_surface(grid, level.density), space).vertices[:, 1] - APEX[1]
+    depth = in_scene(extract_surface(grid, level.density), space, CUBE).vertices[:, 1] - APEX[1]
     near, far = (int((np.abs(depth / wall - 1) < 0.04).sum()) for wall in WALLS)
     return near, far
 

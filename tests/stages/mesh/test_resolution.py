@@ -1,5 +1,6 @@
 """How fine a grid fits into the time there is."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,13 +10,13 @@ from hypothesis import strategies as st
 
 from nerf import REGION_HALF_SIZE
 from nerf.geometry.space_maps import Box
+from stages.mesh.grid_space import points_of_grid
 from stages.mesh.resolution import (
     FIXED_COST,
     MARGIN,
     MIN_POINTS,
     expected_seconds,
     grid_box,
-    points_per_edge,
     reference_seconds,
     resolution_from_training,
     resolution_within,
@@ -63,7 +64,7 @@ def test_the_yardstick_is_the_best_of_a_few(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.parametrize("capture_type", ["forward-facing", "inside-out"])
 def test_a_flat_scenes_grid_spans_its_slice(points, flat, capture_type):
     stray = np.array([[0.1, 0.1, 0.85], [0.5, 0.85, 0.1], [0.0, 0.0, 30.0]])
-    box = grid_box(capture_type, np.concatenate([points, stray]), Box())
+    box = grid_box(capture_type, np.concatenate([points, stray]))
     ends = np.quantile(points[:, flat], [0, 1]) + np.array([-1, 1]) * 2 * REGION_HALF_SIZE * MARGIN
     np.testing.assert_allclose(box[:, flat], ends, atol=0.02)
     rest = [axis for axis in range(3) if axis != flat]
@@ -82,17 +83,19 @@ def test_a_flat_scenes_grid_spans_its_slice(points, flat, capture_type):
     ],
 )
 def test_the_grid_spans_the_region_without_flat_points(points, capture_type):
-    np.testing.assert_array_equal(grid_box(capture_type, points, Box()), CUBE)
+    np.testing.assert_array_equal(grid_box(capture_type, points), CUBE)
 
 
 @pytest.mark.parametrize("resolution", [16, 48, 77, 256])
 def test_a_flat_box_has_as_many_points_and_smaller_voxels(resolution):
-    assert points_per_edge(CUBE, resolution) == resolution and slab_factor(CUBE) == pytest.approx(1)
-    box = grid_box("forward-facing", GROUND, Box())
-    along = points_per_edge(box, resolution)
-    per_edge = (box[1] - box[0]) / 1.8 * (along - 1) + 1
+    none = np.zeros((0, 3))
+    assert points_of_grid(Box(), CUBE, resolution, none) == 3 * (resolution,)
+    assert slab_factor(CUBE) == pytest.approx(1)
+    box = grid_box("forward-facing", GROUND)
+    counts = points_of_grid(Box(), box, resolution, none)
+    along = max(counts)
     assert along > 1.3 * resolution
-    assert per_edge.prod() == pytest.approx(resolution**3, rel=2 / resolution)
+    assert math.prod(counts) == pytest.approx(resolution**3, rel=4 / resolution)
     cut = slab_factor(box) * resolution**2
     assert cut == pytest.approx(along**2, rel=2 / resolution)
 

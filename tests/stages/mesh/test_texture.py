@@ -18,6 +18,7 @@ from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages.io.files import write_png
 from stages.io.photos import Photo, write_photos
 from stages.mesh.files import ColouredMesh, glb_bytes, obj_files
+from stages.mesh.grid_space import VoxelLengths
 from stages.mesh.rasteriser import barycentric, covered_pixels
 from stages.mesh.surface import Surface, vertex_normals
 from stages.mesh.texture.atlas import make_atlas
@@ -41,7 +42,7 @@ def pattern(points):
 
 def known(surface):
     """How well it is known everywhere."""
-    return np.full(len(surface.vertices), 0.05)
+    return VoxelLengths(*2 * [np.full(len(surface.vertices), 0.05)])
 
 
 def sheet(cells=16, half=0.8):
