@@ -24,6 +24,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
+import stages.sfm.colmap  # noqa: F401 -- a thread could not take back the handler of SIGTERM that pycolmap installs
 from pipeline.view.workspace_state import FINISHED, WorkspaceState
 from stages.contract import StageError
 from stages.viewer.page import page, watching
@@ -81,9 +82,6 @@ class ViewServer:
 
     def run(self) -> None:
         """Until Ctrl-C, which arrives as KeyboardInterrupt, or :meth:`stop`."""
-        # Here, as a thread could not take back the handler of SIGTERM that pycolmap installs.
-        import stages.sfm.colmap  # noqa: F401
-
         # Before the niceness, which is a thread's own on Linux: on cores that train, loading torch would take a minute.
         threading.Thread(target=self.state.prepare, daemon=True).start()
         if hasattr(os, "nice"):

@@ -96,7 +96,8 @@ def points_of_grid(space: GridSpace, box: np.ndarray, resolution: int, points: n
         depth_of_all = float(np.median(before)) if len(before) else 2 * space.near
         sides = sides * [*space.slopes, depth_of_all / (2 * space.near)]
     counts = (resolution - 1) * sides / np.prod(sides) ** (1 / 3) + 1
-    return tuple(max(2, round(float(count))) for count in counts)  # pyright: ignore[reportReturnType]
+    x, y, z = (max(2, round(float(count))) for count in counts)
+    return x, y, z
 
 
 def in_scene(surface: Surface, space: GridSpace, region: np.ndarray) -> Surface:

@@ -53,6 +53,9 @@ ELSEWHERE = {
     "nerf/training/vanilla_trainer.py": "sums of micro-batches; refuses non-finite values before the update: "
     "tests/nerf/training/test_vanilla_trainer.py",
     "nerf/training/hash_grid_trainer.py": "likewise: tests/nerf/training/test_hash_grid_trainer.py",
+    "nerf/training/graph_trainer.py": "zeros for gradients that are not finite: "
+    "tests/nerf/training/test_graph_trainer.py",
+    "nerf/kernels/torch/packing.py": "zeros behind samples: tests/nerf/training/test_graph_trainer.py",
     "nerf/training/data_parallel.py": "sums over processes, bit for bit or to 1e-6 those of one: "
     "tests/nerf/training/test_data_parallel.py",
     "nerf/runtime/matmul_precision.py": "lets matrix products be off by 1e-4 if that is faster: "

@@ -45,7 +45,7 @@ def rays_ahead(count: int) -> Rays:
     return Rays(origin, directions / length, torch.full((count,), 0.3), torch.full((count,), 6.0))
 
 
-def test_only_cameras_that_face_one_way_have_a_space_of_their_own() -> None:
+def test_forward_facing_scenes_have_a_space_of_their_own() -> None:
     assert grid_space(FORWARD) is FORWARD
     assert grid_space(Contraction()) == grid_space(Box()) == Box()
     np.testing.assert_array_equal(box_in(Box(), CUBE), CUBE)
@@ -53,7 +53,7 @@ def test_only_cameras_that_face_one_way_have_a_space_of_their_own() -> None:
 
 def test_the_box_holds_what_the_space_shows_of_the_region() -> None:
     low, high = box_in(FORWARD, CUBE)
-    points = torch.from_numpy(np.random.default_rng(0).uniform(*CUBE, (4000, 3)))
+    points = torch.from_numpy(np.random.default_rng(0).uniform(CUBE[0], CUBE[1], (4000, 3)))
     mapped = FORWARD.forward(points).numpy()
     shown = np.all(np.abs(mapped) <= FORWARD.half, axis=1)
     assert shown.sum() > 500 and np.all((mapped[shown] >= low) & (mapped[shown] <= high))
@@ -102,7 +102,8 @@ def test_what_lies_beyond_the_region_is_left_out() -> None:
 
 def test_rays_stop_where_they_stop_in_the_scene() -> None:
     rays, field = rays_ahead(80), DensityIn(FORWARD, Walls())  # pyright: ignore[reportArgumentType]
-    grid = sample_density_grid(field, 160, *torch.tensor(box_in(FORWARD, CUBE), dtype=torch.float32))
+    low, high = torch.tensor(box_in(FORWARD, CUBE), dtype=torch.float32)
+    grid = sample_density_grid(field, 160, low, high)
     mapped = FORWARD.map_rays(rays)
     depth = mapped.to_scene(median_depth(grid, mapped.rays, 160)[:, None])[:, 0] * rays.directions[:, 1]
     near = (rays.directions[:, 0] / rays.directions[:, 1]).abs() < 0.3 / 0.95
@@ -115,14 +116,14 @@ def test_rays_stop_where_they_stop_in_the_scene() -> None:
 def found_of_walls(space: Ndc | Box) -> tuple[int, int]:
     """How many vertices the surface has by the front of each wall."""
     field = DensityIn(space, Walls())  # pyright: ignore[reportArgumentType]
-    grid = sample_density_grid(field, 96, *torch.tensor(box_in(space, CUBE), dtype=torch.float32))
+    low, high = torch.tensor(box_in(space, CUBE), dtype=torch.float32)
+    grid = sample_density_grid(field, 96, low, high)
     level = choose_iso_level(grid, field, space.map_rays(rays_ahead(200)).rays)
     depth = in_scene(extract_surface(grid, level.density), space, CUBE).vertices[:, 1] - APEX[1]
     near, far = (int((np.abs(depth / wall - 1) < 0.04).sum()) for wall in WALLS)
     return near, far
 
 
-def test_a_wall_near_by_has_the_share_of_the_vertices_that_photos_show() -> None:
+def test_near_walls_have_the_vertices_that_photos_show() -> None:
     (near, far), (near_in_scene, far_in_scene) = found_of_walls(FORWARD), found_of_walls(Box())
-    assert near / far > 1.2 * near_in_scene / far_in_scene > 0
-    assert 0.4 < near / far < 0.6, "a third of the view, and its edges"
+    assert near / far > 2 * near_in_scene / far_in_scene > 0

@@ -120,12 +120,12 @@ def test_rays_that_all_miss_the_box_leave_fog(rays):
         (
             torch.zeros(4, 4, 4),
             None,
-            "the field is empty: its density is at most 0 per scene unit: a ray across the box",
+            "the field is empty: its density is at most 0: a ray across the box",
         ),
-        (torch.full((4, 4, 4), 9.0), None, "the field has no surface: its density is 9 to 9 per scene unit"),
+        (torch.full((4, 4, 4), 9.0), None, "the field has no surface: its density is 9 to 9"),
         (torch.full((4, 4, 4), torch.nan), None, "the density is not finite: 64 of 64 grid points are NaN"),
-        (torch.linspace(1, 9, 64).reshape(4, 4, 4), 20.0, "no surface at density 20: density runs from 1 to 9 per"),
-        (torch.linspace(1, 9, 64).reshape(4, 4, 4), 0.5, "no surface at density 0.5: density runs from 1 to 9 per"),
+        (torch.linspace(1, 9, 64).reshape(4, 4, 4), 20.0, "no surface at density 20: density runs from 1 to 9"),
+        (torch.linspace(1, 9, 64).reshape(4, 4, 4), 0.5, "no surface at density 0.5: density runs from 1 to 9"),
     ],
 )
 def test_grids_without_a_surface_are_refused_in_words(values, level, message):
