@@ -67,6 +67,10 @@ def test_files_beside_the_page_are_named(tmp_path: Path, progress: Any):
     for fact in ("0.25 units of the files", "3.5 square units of the files", "40 per scene unit"):
         assert f"<td>{fact}</td>" in html
     assert "pass on both" not in written(inputs, tmp_path / "small", progress)[0]
+    manifest["facts"]["grid_space"] = "ndc"
+    write_json(inputs["mesh"] / "manifest.json", manifest)
+    html, _ = written(inputs, tmp_path / "ndc", progress)
+    assert "<td>40 per unit of normalised device coordinates</td>" in html
 
 
 def test_long_photo_names_are_broken(inputs: dict[str, Path], tmp_path: Path, progress: Any):
