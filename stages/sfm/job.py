@@ -83,6 +83,10 @@ class JobState:
         """Note what the phase took, in earlier runs too."""
         self.seconds[phase] = self.timer.end()
 
+    def left_at_most(self) -> float:
+        """Seconds until sfm is given up, in this run."""
+        return self.started + self.job.max_seconds - time.monotonic()
+
     def left(self) -> tuple[float, str]:
         """Seconds that further strategies may take, and which limit says so: the time it is given, which is for all
         runs together, or the time after which it is given up, which counts from zero in each run."""

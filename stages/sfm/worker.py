@@ -27,6 +27,7 @@ from stages.sfm.matching import capture_sequence, match_photos
 from stages.sfm.retry_strategies import (
     MIN_LONG_FOCAL,
     STRATEGIES,
+    TIME_GIVEN,
     Outcome,
     Situation,
     Skip,
@@ -186,6 +187,10 @@ def _why_infeasible(strategy: Strategy, missing: list[int], state: JobState) -> 
     if not exceeds_time(expected, outcomes, left):
         return None
     rest = f"{rough_duration(max(0.0, left))} of {limit} are left"
+    if limit == TIME_GIVEN and state.usable() is None and not exceeds_time(expected, outcomes, state.left_at_most()):
+        why = f"without cameras nothing goes on, so more time than given is taken: {rest}"
+        state.send(note=Note("sfm.takes-longer", why))
+        return None
     times = f"about {rough_duration(expected)} and the final bundle adjustment, and only {rest}"
     state.send(note=Note("sfm.strategy-too-slow", f"not tried, because it takes {times}: {strategy.description}"))
     return Skip(f"too little was left of {limit}", for_time=True)

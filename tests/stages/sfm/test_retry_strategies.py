@@ -1,10 +1,14 @@
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from stages.sfm import worker
 from stages.sfm.retry_strategies import (
+    MAX_SECONDS_LIMIT,
     STRATEGIES,
+    TIME_GIVEN,
     Outcome,
     Situation,
     Skip,
@@ -184,3 +188,29 @@ APART = "form models of their own"
 def test_a_strategy_that_cannot_help_is_skipped(name: str, change: dict[str, Any], why: str | None) -> None:
     found = reason_against(BY_NAME[name], PLAIN._replace(**change))
     assert found is None if why is None else why in str(found)
+
+
+@pytest.mark.parametrize(
+    ("limit", "found", "at_most", "code"),
+    [
+        (TIME_GIVEN, False, 1000.0, "sfm.takes-longer"),
+        (TIME_GIVEN, False, 20.0, "sfm.strategy-too-slow"),
+        (TIME_GIVEN, True, 1000.0, "sfm.strategy-too-slow"),
+        (MAX_SECONDS_LIMIT, False, 1.0, "sfm.strategy-too-slow"),
+    ],
+)
+def test_the_time_given_is_exceeded_before_all_is_lost(limit: str, found: bool, at_most: float, code: str) -> None:
+    """Where there is a model, the time is kept; the time after which sfm is given up always is."""
+    said, outcome = list[str](), TIMED[0]
+    log = SimpleNamespace(abandoned={}, outcomes=TIMED)
+    state: Any = SimpleNamespace(
+        log=log,
+        photos=[None] * 4,
+        job=SimpleNamespace(matcher="exhaustive"),
+        left=lambda: (1.0, limit),
+        left_at_most=lambda: at_most,
+        usable=lambda: outcome if found else None,
+        send=lambda note: said.append(note.code),
+    )
+    skipped = worker._why_infeasible(STRATEGIES[5], [0, 1, 2, 3], state)
+    assert said == [code] and (skipped is None) == (code == "sfm.takes-longer")
