@@ -331,7 +331,7 @@ class HashGridTrainer:
         """What a batch adds to loss and gradients of a step of so many ``rays``; ``effect_rays``: its rays as ray
         effects make them. With ``capacities`` nothing here waits for a GPU."""
         forward_pass = self.model.forward(
-            effect_rays, batch.jitter, batch.thinning_offset, batch.background, capacities=capacities
+            effect_rays, batch.jitter, batch.thinning_offset, batch.background, capacities
         )
         with span("composite"):
             loss = self._loss(rays, weights, forward_pass, batch)

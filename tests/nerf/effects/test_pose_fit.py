@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from nerf.effects.pose_refinement import fit_pose
-from nerf.fields.hash_grid import HashGridField, HashGridGradients, HashGridPass, HashGridSettings
+from nerf.fields.hash_grid import HashGridField, HashGridGradients, HashGridPass, HashGridSettings, SampleCapacities
 from nerf.geometry.rays import Rays
 from nerf.kernels import torch as reference
 
@@ -17,9 +17,16 @@ FIELD = HashGridSettings(
 class Small(HashGridField):
     """What the same field is in a scene that is smaller by SMALLER."""
 
-    def forward(self, rays: Rays, jitter: Tensor, thinning_offset: Tensor, background: Tensor) -> HashGridPass:
+    def forward(
+        self,
+        rays: Rays,
+        jitter: Tensor,
+        thinning_offset: Tensor,
+        background: Tensor,
+        capacities: SampleCapacities | None = None,
+    ) -> HashGridPass:
         large = Rays(rays.origins / SMALLER, rays.directions, rays.near / SMALLER, rays.far / SMALLER)
-        return super().forward(large, jitter, thinning_offset, background)
+        return super().forward(large, jitter, thinning_offset, background, capacities)
 
     def rays_backward(self, forward_pass: HashGridPass, gradients: HashGridGradients) -> tuple[Tensor, Tensor]:
         origins, directions = super().rays_backward(forward_pass, gradients)
