@@ -22,7 +22,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from nerf.effects import ImageEffects
 from nerf.fields.hash_grid import HashGridField
 from nerf.fields.mlp import Weights
 from nerf.runtime.parallel import in_order
@@ -161,18 +160,9 @@ class LeadingTrainer:
 
     def __init__(self, trainer: HashGridTrainer, attempt: int, ranks: Ranks) -> None:
         self.trainer, self.attempt, self.ranks = trainer, attempt, ranks
+        self.model, self.effects = trainer.model, trainer.effects
         self.exchange = trainer.exchange = RankExchange(ranks, trainer.model)
         self.others_know, self.seconds, self.waited_seconds = False, 0.0, 0.0
-
-    @property
-    def model(self) -> HashGridField:
-        """The field in training."""
-        return self.trainer.model
-
-    @property
-    def effects(self) -> ImageEffects:
-        """The effects between the field and the images."""
-        return self.trainer.effects
 
     def step(self, step: int, progress: float, lr_scale: float = 1.0) -> StepResult:
         """Take a step, all ranks together. Raises NonFinite and changes nothing, or RankLost."""

@@ -19,8 +19,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from nerf.effects import ImageEffects
-from nerf.fields.hash_grid import HashGridField, SampleCapacities
+from nerf.fields.hash_grid import SampleCapacities
 from nerf.fields.mlp import Weights
 from nerf.rendering.early_termination import RoundSize
 from nerf.runtime.profiler import is_profiling
@@ -121,28 +120,19 @@ class GraphTrainer:
 
     def __init__(self, trainer: HashGridTrainer, capture: Callable[..., ReplayableStep] = StepGraph) -> None:
         self.trainer, self.capture = trainer, capture
+        self.model, self.effects = trainer.model, trainer.effects
         self.graph: ReplayableStep | None = None
         self.fits, self.lacks_memory, self.refused = True, False, 0
         self.spare = SPARE_CAPACITY
         self.unread: _Report | None = None
         self.last = StepResult(0.0, 0.0, 0, 0, 0)
 
-    @property
-    def model(self) -> HashGridField:
-        """The field in training."""
-        return self.trainer.model
-
-    @property
-    def effects(self) -> ImageEffects:
-        """The effects between the field and the images."""
-        return self.trainer.effects
-
     def step(self, step: int, progress: float, lr_scale: float = 1.0) -> StepResult:
         """One batch, one update."""
-        trainer, graph = self.trainer, self.graph
+        trainer = self.trainer
         single = trainer.settings.micro_batches == 1 and not is_profiling() and not self.lacks_memory
-        if single and graph is not None and self._suits(graph, trainer.has_depth_loss(progress)):
-            return self._step_by(graph, step, progress, lr_scale)
+        if single and self.graph is not None and self._suits(self.graph, trainer.has_depth_loss(progress)):
+            return self._step_by(self.graph, step, progress, lr_scale)
         self._read()
         rays = trainer.rays_per_micro_batch()
         steady = abs(rays / max(1, self.last.rays) - 1) <= STEADY_CHANGE
@@ -190,16 +180,14 @@ class GraphTrainer:
             numbers = found.loss, found.squared_error, found.grad_norm, geometry, found.fits, *counts
             return _zero_unless(usable, found), torch.stack([each.double() for each in numbers])
 
-        try:
-            self.graph, self.fits = self.capture(compute, batch, weights, self.graph), True
-        except torch.OutOfMemoryError:
-            # A capture gets no memory that steps before it have left cached.
-            self.graph = None
-            torch.cuda.empty_cache()
+        for _ in range(2):
             try:
-                self.graph, self.fits = self.capture(compute, batch, weights, None), True
-            except torch.OutOfMemoryError:
-                self.lacks_memory = True
+                self.graph, self.fits = self.capture(compute, batch, weights, self.graph), True
+                return
+            except torch.OutOfMemoryError:  # a capture gets no memory that steps before it have left cached
+                self.graph = None
+                torch.cuda.empty_cache()
+        self.lacks_memory = True
 
     def _read(self) -> None:
         """What the step before was, once the GPU has computed it. Raises NonFinite."""

@@ -178,10 +178,11 @@ def _covers(label: np.ndarray, area: np.ndarray, marked: np.ndarray, fraction: f
 
 
 def boundary(
-    surface: Surface, ends: tuple[np.ndarray, np.ndarray], voxel_size: VoxelSize, cropped: bool = False
+    surface: Surface, extent: tuple[np.ndarray, np.ndarray], voxel_size: VoxelSize, cropped: bool = False
 ) -> str:
-    """Where the surface ends: "watertight", or "open" and where. ``ends``: the region of the scene that is meshed, and
-    the grid's box in its space (2, 3 each). Of one that was ``cropped`` it is not known which border is the crop's."""
+    """Where the surface ends: "watertight", or "open" and where. ``extent``: the region of the scene that is meshed,
+    and the grid's box in its space (2, 3 each). Of one that was ``cropped`` it is not known which border is the
+    crop's."""
     if is_watertight(surface):
         return "watertight"
     border = border_vertices(surface)
@@ -189,7 +190,7 @@ def boundary(
         return "closed, but not a manifold"
     if cropped:
         return "open, cropped by --mesh.box"
-    (region, box), mapped = ends, voxel_size.space.forward(torch.from_numpy(border)).numpy()
+    (region, box), mapped = extent, voxel_size.space.forward(torch.from_numpy(border)).numpy()
     reach = np.maximum(*voxel_size.at(border))[:, None]
     at_box = _next_to(region, border, reach / 2) | _next_to(box, mapped, voxel_size.spacing.max() / 2)
     places = [("at the edge of the region", at_box.any()), ("where too few photos see it", not at_box.all())]

@@ -105,8 +105,8 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     space = grid_space(source.space)
     field = DensityIn(space, source.model)
     region = grid_box(source.scene.capture_type, source.points)
-    box = box_in(space, region)
-    grid = _density_grid(config, field, region, source, progress)
+    extent = region, box_in(space, region)
+    grid = _density_grid(config, field, extent, source, progress)
     voxel_size = VoxelSize(space, grid.spacing().cpu().numpy())
     views = source.scene.of_split("train")
     maps = shadow_maps(
@@ -123,7 +123,7 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     )
     cropped = _cropped(config, cleaned.surface, source)
     surface = decimate(cropped, config.max_faces or default_faces(config, len(cropped.faces)), source.space)
-    ends = boundary(surface, (region, box), voxel_size, cropped=len(cropped.faces) < len(cleaned.surface.faces))
+    ends = boundary(surface, extent, voxel_size, cropped=len(cropped.faces) < len(cleaned.surface.faces))
     if config.close:
         surface, closed = close_holes(surface, config.close)
         ends = "watertight" if is_watertight(surface) else ends
@@ -181,15 +181,16 @@ def _textured(
 
 
 def _density_grid(
-    config: "Config", field: DensityIn, region: np.ndarray, source: Source, progress: Progress
+    config: "Config", field: DensityIn, extent: tuple[np.ndarray, np.ndarray], source: Source, progress: Progress
 ) -> DensityGrid:
+    """Over the region of the scene and the grid's box in its space that are its ``extent``."""
     assert config.resolution is not None
+    region, box = extent
     bytes_per_point = BYTES_PER_POINT * point_cost(slab_factor(region))
     fits = int((available_bytes() / bytes_per_point) ** (1 / 3)) // 16 * 16
     hint = f"Try --mesh.resolution {fits}." if fits >= 16 else "Close other programs."
     needed = bytes_per_point * config.resolution**3
     check_memory(needed, "the mesh", f"a density grid of {config.resolution}³ points needs", hint)
-    box = box_in(field.space, region)
     low, high = torch.tensor(box, dtype=torch.float32, device=source.device)
     counts = points_of_grid(field.space, box, config.resolution, source.points)
 

@@ -53,5 +53,5 @@ def pack_rounds(rounds: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samp
     chosen = torch.cat([no_padding(each) for each in rounds])
     order = torch.zeros_like(ray)
     order[torch.cat(places)[chosen]] = torch.arange(len(ray), dtype=torch.int32, device=ray.device)[chosen]
-    inside = torch.arange(len(ray), device=ray.device) < starts[-1]
+    inside = no_padding(Samples(starts, ray, t, dt))
     return Samples(starts, *(torch.where(inside, part.index_select(0, order), 0) for part in (ray, t, dt))), order
