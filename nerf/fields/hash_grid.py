@@ -153,7 +153,6 @@ class HashGridPass(NamedTuple):
     points: Float[Tensor, "samples 3"]
     optical_thickness: Float[Tensor, "samples"]
     density: DensityPass
-    harmonics: Float[Tensor, "rays direction"]
     colour: ColourPass
     rendering: Rendering
     weights: Float[Tensor, "samples"]
@@ -245,7 +244,7 @@ class HashGridField(nn.Module):
         density = self._density_pass(unit.clamp(0, 1))
         ray_hidden = mlp.direction_hidden(self.weights, self.encode_directions(directions.reshape(-1, 3).contiguous()))
         each = torch.arange(len(unit), dtype=torch.int32, device=unit.device)  # a ray of its own for every point
-        colour = mlp.colour_of(self.weights, self.backend, each, density.geometry_features, ray_hidden)
+        colour = mlp.colour_forward(self.weights, self.backend, each, density.geometry_features, ray_hidden)
         return torch.where(sampled, density.sigma, 0).view(points.shape[:-1]), colour.view(points.shape)
 
     def _to_unit(self, points: Float[Tensor, "*points 3"]) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
@@ -273,7 +272,7 @@ class HashGridField(nn.Module):
                 samples = _in_scene(mapped, samples)
                 selected = backend.select_colour_samples(samples, density.sigma, OPACITY_STEP, depth, accumulated)
                 geometry_features = backend.gather_rows(density.geometry_features, selected.rows)
-            colour = mlp.colour_of(self.weights, backend, selected.samples.ray, geometry_features, ray_hidden)
+            colour = mlp.colour_forward(self.weights, backend, selected.samples.ray, geometry_features, ray_hidden)
             with span("composite"):
                 backend.accumulate_colours(selected, colour, rendered)
         transmittance, opacity = (each.to(rendered.dtype) for each in (torch.exp(-depth), -torch.expm1(-depth)))
@@ -317,15 +316,16 @@ class HashGridField(nn.Module):
         with span("encode"):
             harmonics = self.encode_directions(rays.directions)
             ray_hidden = mlp.direction_hidden(self.weights, harmonics)
-        colour = mlp.colour_forward(self.weights, backend, samples, density.geometry_features, ray_hidden)
+        colour = mlp.colour_forward(self.weights, backend, samples.ray, density.geometry_features, ray_hidden)
         with span("composite"):
             of_scene = _in_scene(mapped, samples)
-            rendering, weights = backend.composite(of_scene, density.sigma, colour.colour, background, rays.far)
+            rendering, weights = backend.composite(of_scene, density.sigma, colour, background, rays.far)
         needed = SampleCapacities(tuple(RoundSize(each.per_ray, len(each.points)) for each in rounds), len(points))
         fits = jitter.new_ones((), dtype=torch.bool) if capacities is None else self._fits(rounds, samples)
         of_samples = samples, points, optical_thickness, density
         counted = needed, marched.starts[-1], fits
-        return HashGridPass(rays, mapped, background, *counted, *of_samples, harmonics, colour, rendering, weights)
+        of_colour = ColourPass(harmonics, ray_hidden, colour)
+        return HashGridPass(rays, mapped, background, *counted, *of_samples, of_colour, rendering, weights)
 
     def _fits(self, rounds: Sequence[MarchingRound], visible: Samples) -> Bool[Tensor, ""]:
         """Whether no array of samples is full, and no ray goes on behind the last round."""
@@ -349,7 +349,7 @@ class HashGridField(nn.Module):
             grad_weights,
         )
         of_colour = mlp.colour_backward(
-            self.weights, backend, forward_pass.samples, colour, forward_pass.harmonics, grad_colour
+            self.weights, backend, forward_pass.samples, density.geometry_features, colour, grad_colour
         )
         of_density = mlp.density_backward(self.weights, backend, density, grad_sigma, of_colour.geometry_features)
         weights = Weights(of_density.density_hidden, of_density.density_out, *of_colour[:2])
@@ -408,7 +408,7 @@ class HashGridField(nn.Module):
     def _density_pass(self, unit: Float[Tensor, "points 3"]) -> DensityPass:
         with span("gather", WorkCounts(gathered_rows=CORNERS * len(self.layout.resolutions) * len(unit))):
             features = self.backend.encode(self.layout, self.table, unit)
-        return mlp.density_forward(self.weights, features)
+        return mlp.density_forward(self.weights, self.backend, features)
 
 
 def _in_scene(mapped: MappedRays, samples: Samples) -> Samples:

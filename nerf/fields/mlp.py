@@ -1,29 +1,21 @@
-"""The two small networks behind the grids, without biases, forward and backward by hand: no autograd in the hot loop.
-
-All weights have rows of HIDDEN numbers: hidden layers are (inputs, HIDDEN), outputs (outputs, HIDDEN), which matrix
-products with few outputs need to be fast: (n, 64) x (64, 3) takes three times as long as with the smaller one
-transposed. Backward is the chain rule: of Y = X W, dW = Xᵀ dY and dX = dY Wᵀ.
+"""The two small networks behind the grids, without biases: features to density and geometry features, these and the
+viewing direction to colour. Forward and backward by hand (``nerf.kernels``): no autograd in the hot loop.
 """
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
 
-from nerf.kernels import Backend, Samples
+from nerf.kernels import HIDDEN, Backend, Layers, Samples
 from nerf.runtime.profiler import WorkCounts, span
 
-HIDDEN = 64
 GEOMETRY_FEATURES = (
     16  # numbers that the density network hands to the colour network; the first is the logarithm of density
 )
 DIRECTION_FEATURES = 16  # spherical harmonics, where colour depends on the direction
 MAX_LOG_DENSITY = 15.0
-# Samples whose hidden layer of the density network exists at a time: as many as stay in a core's cache
-# (docs/experiments/step_time.md); on a GPU all.
-BLOCK = {"cpu": 1 << 12, "cuda": 1 << 22}
 
 
 class Weights(NamedTuple):
@@ -34,10 +26,19 @@ class Weights(NamedTuple):
     colour_hidden: Float[Tensor, "geometry_features_and_direction hidden"]
     colour_out: Float[Tensor, "3 hidden"]
 
+    @property
+    def density(self) -> Layers:
+        """The density network."""
+        return Layers(self.density_hidden, self.density_out)
+
+    @property
+    def colour(self) -> Layers:
+        """The colour network, as far as it is the samples' own (:func:`direction_hidden`)."""
+        return Layers(self.colour_hidden[:GEOMETRY_FEATURES], self.colour_out)
+
 
 class DensityPass(NamedTuple):
-    """What the density network made of ``features``. Its hidden layer, larger than all of them, is not kept: to compute
-    it again takes less time than to fetch it from memory."""
+    """What the density network made of ``features``."""
 
     features: Float[Tensor, "samples features"]
     geometry_features: Float[Tensor, "samples geometry_features"]
@@ -45,10 +46,11 @@ class DensityPass(NamedTuple):
 
 
 class ColourPass(NamedTuple):
-    """What the colour network made of the samples' ``geometry_features`` and their rays, layer by layer."""
+    """What the colour network made of the samples' geometry features and of their rays' ``harmonics``, which add
+    ``ray_hidden`` to its hidden layer."""
 
-    geometry_features: Float[Tensor, "samples geometry_features"]
-    hidden: Float[Tensor, "samples hidden"]
+    harmonics: Float[Tensor, "rays direction"]
+    ray_hidden: Float[Tensor, "rays hidden"]
     colour: Float[Tensor, "samples 3"]
 
 
@@ -94,28 +96,15 @@ def density_flops(weights: Weights) -> int:
 
 
 def colour_flops(weights: Weights) -> int:
-    """Multiplications and additions of a sample's colour, without what its ray shares; twice as many on the
-    way back."""
+    """Multiplications and additions of a sample's colour, without what its ray shares; the way back as of density."""
     return 2 * (GEOMETRY_FEATURES * HIDDEN + weights.colour_out.numel())
 
 
-def density_forward(weights: Weights, features: Float[Tensor, "samples features"]) -> DensityPass:
+def density_forward(weights: Weights, backend: Backend, features: Float[Tensor, "samples features"]) -> DensityPass:
     """Features to geometry and density."""
     with span("mlp", WorkCounts(matmul_flops=density_flops(weights) * len(features))):
-        geometry_features = features.new_empty(len(features), GEOMETRY_FEATURES)
-        for rows in _blocks(features):
-            torch.mm(_density_hidden(weights, features[rows]), weights.density_out.T, out=geometry_features[rows])
+        geometry_features = backend.mlp_forward(weights.density, features)
         return DensityPass(features, geometry_features, sigma_of(geometry_features))
-
-
-def _density_hidden(weights: Weights, features: Float[Tensor, "samples features"]) -> Float[Tensor, "samples hidden"]:
-    return (features @ weights.density_hidden).relu_()
-
-
-def _blocks(samples: Float[Tensor, "samples _"]) -> Iterator[slice]:
-    """All samples, BLOCK at a time."""
-    size = BLOCK[samples.device.type]
-    return (slice(first, first + size) for first in range(0, len(samples), size))
 
 
 def sigma_of(geometry_features: Float[Tensor, "samples geometry_features"]) -> Float[Tensor, "samples"]:
@@ -132,54 +121,34 @@ def direction_hidden(weights: Weights, harmonics: Float[Tensor, "rays direction"
 def colour_forward(
     weights: Weights,
     backend: Backend,
-    samples: Samples,
-    geometry_features: Float[Tensor, "samples geometry_features"],
-    ray_hidden: Float[Tensor, "rays hidden"],
-) -> ColourPass:
-    """Geometry and viewing direction (:func:`direction_hidden`) to colour, through a sigmoid."""
-    with span("mlp", WorkCounts(matmul_flops=colour_flops(weights) * len(geometry_features))):
-        hidden = geometry_features @ weights.colour_hidden[:GEOMETRY_FEATURES]
-        backend.add_ray_relu(samples, hidden, ray_hidden)
-        return ColourPass(geometry_features, hidden, (hidden @ weights.colour_out.T).sigmoid_())
-
-
-def colour_of(
-    weights: Weights,
-    backend: Backend,
     ray: Int32[Tensor, "samples"],
     geometry_features: Float[Tensor, "samples geometry_features"],
     ray_hidden: Float[Tensor, "rays hidden"],
 ) -> Float[Tensor, "samples 3"]:
-    """What :func:`colour_forward` says, for samples of rays ``ray``, where no way back is needed: nothing is kept."""
+    """Geometry and each sample's ray (:func:`direction_hidden`) to colour, through a sigmoid."""
     with span("mlp", WorkCounts(matmul_flops=colour_flops(weights) * len(geometry_features))):
-        logits = geometry_features.new_empty(len(geometry_features), 3)
-        for rows in _blocks(geometry_features):
-            hidden = backend.gather_rows(ray_hidden, ray[rows]).addmm_(
-                geometry_features[rows], weights.colour_hidden[:GEOMETRY_FEATURES]
-            )
-            torch.mm(hidden.relu_(), weights.colour_out.T, out=logits[rows])
-        return logits.sigmoid_()
+        return backend.mlp_forward(weights.colour, geometry_features, ray, ray_hidden).sigmoid_()
 
 
 def colour_backward(
     weights: Weights,
     backend: Backend,
     samples: Samples,
+    geometry_features: Float[Tensor, "samples geometry_features"],
     done: ColourPass,
-    harmonics: Float[Tensor, "rays direction"],
     grad_colour: Float[Tensor, "samples 3"],
 ) -> ColourGradients:
     """Gradients of the network's weights and of its inputs, given that of the colour."""
     grad_logits = grad_colour * done.colour * (1 - done.colour)
-    grad_hidden = grad_logits @ weights.colour_out
-    grad_of_ray = backend.add_ray_relu_backward(samples, done.hidden, grad_hidden)
-    of_hidden = torch.cat([done.geometry_features.T @ grad_hidden, harmonics.T @ grad_of_ray])
-    grad_geometry_features = grad_hidden @ weights.colour_hidden[:GEOMETRY_FEATURES].T
+    of_hidden, of_out, of_geometry_features, of_rays = backend.mlp_backward(
+        weights.colour, geometry_features, grad_logits, samples, done.ray_hidden
+    )
+    assert of_rays is not None, "rays were given"
     return ColourGradients(
-        of_hidden,
-        grad_logits.T @ done.hidden,
-        grad_geometry_features,
-        grad_of_ray @ weights.colour_hidden[GEOMETRY_FEATURES:].T,
+        torch.cat([of_hidden, done.harmonics.T @ of_rays]),
+        of_out,
+        of_geometry_features,
+        of_rays @ weights.colour_hidden[GEOMETRY_FEATURES:].T,
     )
 
 
@@ -194,16 +163,7 @@ def density_backward(
     colour network saw it, to which the former's is added in place."""
     within = done.geometry_features[:, 0] <= MAX_LOG_DENSITY
     grad_geometry_features[:, 0] += torch.where(within, grad_sigma * done.sigma, 0)
-    of_hidden, of_out = torch.zeros_like(weights.density_hidden), torch.zeros_like(weights.density_out)
-    grad_features = torch.empty_like(done.features)
-    for rows in _blocks(done.features):
-        features, grad_out = done.features[rows], grad_geometry_features[rows]
-        hidden, grad_hidden = _density_hidden(weights, features), grad_out @ weights.density_out
-        backend.relu_backward(hidden, grad_hidden)
-        of_hidden += features.T @ grad_hidden
-        of_out += grad_out.T @ hidden
-        torch.mm(grad_hidden, weights.density_hidden.T, out=grad_features[rows])
-    return DensityGradients(of_hidden, of_out, grad_features)
+    return DensityGradients(*backend.mlp_backward(weights.density, done.features, grad_geometry_features)[:3])
 
 
 def _glorot(others: int, random: torch.Generator) -> Float[Tensor, "others hidden"]:

@@ -30,6 +30,7 @@ from torch import Tensor
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 
+HIDDEN = 64  # numbers in the hidden layer of the networks
 ROW_ALIGNMENT = 4  # of four features: a cache line, and a whole number of vectors for Adam
 
 
@@ -125,6 +126,24 @@ class Samples(NamedTuple):
     dt: Float[Tensor, "samples"]
 
 
+class Layers(NamedTuple):
+    """The weights of a network of one hidden layer (``nerf.kernels.torch.mlp``). All rows have HIDDEN numbers, which
+    matrix products with few outputs need to be fast: (n, 64) x (64, 3) takes three times as long as with the smaller
+    one transposed."""
+
+    hidden: Float[Tensor, "inputs hidden"]
+    out: Float[Tensor, "outputs hidden"]
+
+
+class MlpGradients(NamedTuple):
+    """Of a network's layers, of its inputs, and of what rays add to its hidden layer, if they do."""
+
+    hidden: Float[Tensor, "inputs hidden"]
+    out: Float[Tensor, "outputs hidden"]
+    inputs: Float[Tensor, "samples inputs"]
+    ray_hidden: Float[Tensor, "rays hidden"] | None
+
+
 class ColourSamples(NamedTuple):
     """The samples whose colours are evaluated (``nerf.kernels.torch.colour_sampling``), packed, with their rows among
     all samples and the opacity that each stands for."""
@@ -187,15 +206,22 @@ class Backend(Protocol):
         self, directions: Float[Tensor, "rays 3"], grad: Float[Tensor, "rays 16"]
     ) -> Float[Tensor, "rays 3"]: ...
 
-    def add_ray_relu(
-        self, samples: Samples, hidden: Float[Tensor, "samples 64"], ray_hidden: Float[Tensor, "rays 64"]
-    ) -> None: ...
+    def mlp_forward(
+        self,
+        layers: Layers,
+        inputs: Float[Tensor, "samples inputs"],
+        ray: Int32[Tensor, "samples"] | None = None,
+        ray_hidden: Float[Tensor, "rays hidden"] | None = None,
+    ) -> Float[Tensor, "samples outputs"]: ...
 
-    def add_ray_relu_backward(
-        self, samples: Samples, hidden: Float[Tensor, "samples 64"], grad: Float[Tensor, "samples 64"]
-    ) -> Float[Tensor, "rays 64"]: ...
-
-    def relu_backward(self, hidden: Float[Tensor, "samples 64"], grad: Float[Tensor, "samples 64"]) -> None: ...
+    def mlp_backward(
+        self,
+        layers: Layers,
+        inputs: Float[Tensor, "samples inputs"],
+        grad: Float[Tensor, "samples outputs"],
+        samples: Samples | None = None,
+        ray_hidden: Float[Tensor, "rays hidden"] | None = None,
+    ) -> MlpGradients: ...
 
     def finish_round(
         self,

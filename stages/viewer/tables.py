@@ -15,7 +15,8 @@ from torch import Tensor
 
 from nerf.fields.background import BACKGROUND_LAYOUT
 from nerf.fields.hash_grid import HashGridField
-from nerf.fields.mlp import GEOMETRY_FEATURES, HIDDEN
+from nerf.fields.mlp import GEOMETRY_FEATURES
+from nerf.kernels import HIDDEN
 from nerf.kernels import GridLayout
 
 Bits = Literal[8, 16]

@@ -11,8 +11,8 @@ from nerf.kernels.torch.distortion_loss import distortion, distortion_backward
 from nerf.kernels.torch.early_termination import finish_round, pack_rounds
 from nerf.kernels.torch.encoding import encode, encode_backward_points, encode_backward_table
 from nerf.kernels.torch.gather import gather_rows
-from nerf.kernels.torch.hidden_layer import add_ray_relu, add_ray_relu_backward, relu_backward
 from nerf.kernels.torch.marching import march, sample_points, sample_points_backward
+from nerf.kernels.torch.mlp import mlp_backward, mlp_forward
 from nerf.kernels.torch.occupancy import cell_corners, occupancy_bits, scatter_max
 from nerf.kernels.torch.spherical_harmonics import spherical_harmonics, spherical_harmonics_backward
 
@@ -22,8 +22,6 @@ __all__ = [
     "CAPTURABLE",
     "accumulate_colours",
     "adam",
-    "add_ray_relu",
-    "add_ray_relu_backward",
     "cell_corners",
     "composite",
     "composite_backward",
@@ -37,9 +35,10 @@ __all__ = [
     "finish_round",
     "gather_rows",
     "march",
+    "mlp_backward",
+    "mlp_forward",
     "occupancy_bits",
     "pack_rounds",
-    "relu_backward",
     "sample_points",
     "sample_points_backward",
     "scatter_max",

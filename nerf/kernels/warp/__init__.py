@@ -13,9 +13,9 @@ from nerf.kernels.warp.distortion_loss import distortion, distortion_backward
 from nerf.kernels.warp.early_termination import finish_round, pack_rounds
 from nerf.kernels.warp.encoding import encode, encode_backward_points, encode_backward_table
 from nerf.kernels.warp.gather import gather_rows
-from nerf.kernels.warp.hidden_layer import add_ray_relu, add_ray_relu_backward, relu_backward
 from nerf.kernels.warp.launch import compile_kernels, unavailable_reason
 from nerf.kernels.warp.marching import march, sample_points, sample_points_backward
+from nerf.kernels.warp.mlp import mlp_backward, mlp_forward
 from nerf.kernels.warp.occupancy import cell_corners, occupancy_bits, scatter_max
 from nerf.kernels.warp.spherical_harmonics import spherical_harmonics, spherical_harmonics_backward
 
@@ -25,8 +25,6 @@ __all__ = [
     "CAPTURABLE",
     "accumulate_colours",
     "adam",
-    "add_ray_relu",
-    "add_ray_relu_backward",
     "cell_corners",
     "compile_kernels",
     "composite",
@@ -41,9 +39,10 @@ __all__ = [
     "finish_round",
     "gather_rows",
     "march",
+    "mlp_backward",
+    "mlp_forward",
     "occupancy_bits",
     "pack_rounds",
-    "relu_backward",
     "sample_points",
     "sample_points_backward",
     "scatter_max",

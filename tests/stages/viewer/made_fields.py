@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
-from nerf.fields.mlp import HIDDEN
+from nerf.kernels import HIDDEN
 from nerf.geometry.scene import Scene
 from nerf.geometry.space_maps import Box, SpaceMap
 from nerf.geometry.space_maps.contraction import Contraction
