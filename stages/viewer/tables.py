@@ -16,8 +16,7 @@ from torch import Tensor
 from nerf.fields.background import BACKGROUND_LAYOUT
 from nerf.fields.hash_grid import HashGridField
 from nerf.fields.mlp import GEOMETRY_FEATURES
-from nerf.kernels import HIDDEN
-from nerf.kernels import GridLayout
+from nerf.kernels import HIDDEN, GridLayout
 
 Bits = Literal[8, 16]
 FEATURES = 4  # of a row: one texel

@@ -41,7 +41,7 @@ def in_one_pass(
     density = model._density_pass(reference.sample_points(given, samples, model.space.bends_rays))
     front, seen = reference.visible_samples(samples, density.sigma, EARLY_STOP_TRANSMITTANCE, thin, jitter)
     ray_hidden = mlp.direction_hidden(model.weights, reference.spherical_harmonics(given.directions))
-    colour = mlp.colour_forward(model.weights, reference, front, density.geometry_features[seen], ray_hidden).colour
+    colour = mlp.colour_forward(model.weights, reference, front.ray, density.geometry_features[seen], ray_hidden)
     behind = background.repeat(len(jitter), 1)
     rendering, _ = reference.composite(front, density.sigma[seen], colour, behind, given.far)
     return len(samples.t), front, rendering

@@ -12,9 +12,6 @@ DOCUMENT = Path(__file__).parents[2] / "docs" / "NUMERICS.md"
 ELSEWHERE = {
     "nerf/kernels/__init__.py": "resolutions rounded, rows in whole numbers: tests/nerf/kernels/torch/test_encoding.py",
     "nerf/kernels/torch/gather.py": "rows are copied: tests/nerf/kernels/warp/test_gpu_kernels.py",
-    "nerf/kernels/torch/hidden_layer.py": "max(x + y, 0) and its mask, bit for bit: "
-    "tests/nerf/kernels/warp/test_warp.py; "
-    "NaN stays NaN: tests/numerics/test_not_a_number.py",
     "nerf/kernels/torch/occupancy.py": "comparisons and bits, exact: "
     "tests/nerf/kernels/torch/test_occupancy.py; a NaN cell "
     "counts as occupied",

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nerf.fields.interface import Rendering
-from nerf.kernels import Backend, RayStepping, Samples, grid_layout, warp
+from nerf.kernels import Backend, Layers, RayStepping, Samples, grid_layout, warp
 from nerf.kernels import torch as reference
 
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["torch", "warp"])
@@ -46,11 +46,18 @@ def test_a_colour_that_is_not_a_number_reaches_the_picture(backend: Backend) -> 
 
 @BACKENDS
 def test_a_nan_hidden_unit_is_not_rectified(backend: Backend) -> None:
-    hidden = with_nan(torch.full((5, 64), -1.0))
-    backend.add_ray_relu(SAMPLES, hidden, torch.zeros(2, 64))
-    assert hidden[1].isnan().all() and not hidden[[0, 2, 3, 4]].any()
-    grad = with_nan(torch.ones(5, 64))
-    assert backend.add_ray_relu_backward(SAMPLES, torch.ones(5, 64), grad)[0].isnan().all()
+    layers, inputs = Layers(torch.full((4, 64), -1.0), torch.ones(3, 64)), with_nan(torch.ones(5, 4))
+    outputs = backend.mlp_forward(layers, inputs, SAMPLES.ray, torch.zeros(2, 64))
+    assert outputs[1].isnan().all() and not outputs[[0, 2, 3, 4]].any()
+
+
+@BACKENDS
+def test_a_nan_gradient_passes_through_the_networks(backend: Backend) -> None:
+    layers, grad = Layers(torch.ones(4, 64), torch.ones(3, 64)), with_nan(torch.ones(5, 3))
+    found = backend.mlp_backward(layers, torch.ones(5, 4), grad, SAMPLES, torch.zeros(2, 64))
+    assert found.hidden.isnan().all() and found.out.isnan().all() and found.inputs[1].isnan().all()
+    assert found.ray_hidden is not None and found.ray_hidden[0].isnan().all()
+    assert found.inputs[[0, 2, 3, 4]].isfinite().all() and found.ray_hidden[1].isfinite().all()
 
 
 @BACKENDS

@@ -84,7 +84,11 @@ def backward_in_blocks(
     ray_hidden: Float[Tensor, "rays hidden"] | None,
 ) -> MlpGradients:
     """What :func:`mlp_backward` says, by any functions of the hidden layer."""
-    of_hidden, of_out, of_inputs = torch.zeros_like(layers.hidden), torch.zeros_like(layers.out), torch.empty_like(inputs)
+    of_hidden, of_out, of_inputs = (
+        torch.zeros_like(layers.hidden),
+        torch.zeros_like(layers.out),
+        torch.empty_like(inputs),
+    )
     of_rays = None if ray_hidden is None else torch.zeros_like(ray_hidden)
     for rows in _blocks(inputs):
         hidden = hidden_of(layers, inputs[rows], None if samples is None else samples.ray[rows], ray_hidden)

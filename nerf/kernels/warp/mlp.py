@@ -1,5 +1,5 @@
-"""The networks (``nerf.kernels.torch.mlp``). On a CPU a tile of samples goes through all layers at once, so that nothing
-but inputs and outputs leaves a core's cache; a GPU multiplies matrices by torch."""
+"""The networks (``nerf.kernels.torch.mlp``). On a CPU a tile of samples goes through all layers at once, so that
+nothing but inputs and outputs leaves a core's cache; a GPU multiplies matrices by torch."""
 
 from typing import Any
 
@@ -76,11 +76,13 @@ def _padded_columns(weights: Float[Tensor, "rows hidden"]) -> Float[Tensor, "hid
 
 # In C++, for sums that stay in registers: a dozen of them take turns, so that none waits for its own last addition, and
 # each weight that is read serves a group of samples.
-_VECTORS = f"""
+_VECTORS = (
+    f"""
 #ifndef __CUDA_ARCH__
 #pragma clang fp contract(fast)
     constexpr int HIDDEN = {HIDDEN}, TILE = {TILE}, MAX_LANES = {MAX_LANES}, GROUP = 6, LONG_GROUP = 12;
-""" + """
+"""
+    + """
 #ifdef __AVX512F__
     constexpr int LANES = 16;
 #else
@@ -96,6 +98,7 @@ _VECTORS = f"""
     for (int s = 0; with_rays && s < count; ++s)
         assert(rays.data[first + s] >= 0 && (rays.data[first + s] + 1) * HIDDEN <= ray_hidden.shape[0]);
 
+    const auto aligned = [](int size) { return (size + MAX_LANES - 1) / MAX_LANES * MAX_LANES; };
     // What a group's rays add to columns j ... of their hidden layer; nothing without rays.
     const auto begin = [&](int s, int j, vec sum[GROUP][2]) {
         for (int i = 0; i < GROUP; ++i)
@@ -119,7 +122,7 @@ _VECTORS = f"""
     };
     // Rows of a tile (TILE, HIDDEN) times columns (HIDDEN, padded), the first ``size`` of which are kept.
     const auto multiply_columns = [&](const float* rows, const float* columns, int size, float* target) {
-        const int padded = (size + MAX_LANES - 1) / MAX_LANES * MAX_LANES;
+        const int padded = aligned(size);
         for (int s = 0; s < count; s += LONG_GROUP)
             for (int j = 0; j < size; j += LANES) {
                 vec sum[LONG_GROUP];
@@ -144,13 +147,13 @@ _VECTORS = f"""
     // max(y, 0), and NaN for NaN: 0 y changes no finite number.
     const auto rectified = [](vec y) { return y > 0.0f ? y : 0.0f * y; };
 """
+)
 
 
 @wp.func_native(
     _VECTORS
     + """
-    const int padded = (size + MAX_LANES - 1) / MAX_LANES * MAX_LANES;
-    assert(outputs.shape[0] == total * size && columns.shape[0] == HIDDEN * padded);
+    assert(outputs.shape[0] == total * size && columns.shape[0] == HIDDEN * aligned(size));
     alignas(64) float hidden[TILE * HIDDEN];
     for (int s = 0; s < count; s += GROUP)
         for (int j = 0; j < HIDDEN; j += 2 * LANES) {
@@ -183,7 +186,7 @@ def _forward_tile(
     _VECTORS
     + """
     assert(grad_inputs.shape[0] == total * width && grad.shape[0] == total * size);
-    assert(out_weights.shape[0] == size * HIDDEN && columns.shape[0] == HIDDEN * ((width + MAX_LANES - 1) / MAX_LANES * MAX_LANES));
+    assert(out_weights.shape[0] == size * HIDDEN && columns.shape[0] == HIDDEN * aligned(width));
     assert(grad_hidden_weights.shape[0] == width * HIDDEN && grad_out_weights.shape[0] == size * HIDDEN);
     assert(!with_rays || grad_ray_hidden.shape[0] == ray_hidden.shape[0]);
     const float* const dy = grad.data + (long long)first * size;
@@ -260,8 +263,8 @@ def _backward_tile(
     grad_out_weights: wp.array[float],
     grad_ray_hidden: wp.array[float],
 ):
-    """What a tile of samples, with ``size`` outputs each, adds to the gradients; ``columns``: the hidden layer's weights,
-    transposed and padded."""
+    """What a tile of samples, with ``size`` outputs each, adds to the gradients; ``columns``: the hidden layer's
+    weights, transposed and padded."""
 
 
 @wp.kernel

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nerf.fields import background, mlp
-from nerf.fields.mlp import DIRECTION_FEATURES, GEOMETRY_FEATURES, MAX_LOG_DENSITY, DensityPass, Weights
+from nerf.fields.mlp import DIRECTION_FEATURES, GEOMETRY_FEATURES, MAX_LOG_DENSITY, ColourPass, DensityPass, Weights
 from nerf.fields.vanilla import SOFTPLUS_SHIFT, shifted_softplus
 from nerf.kernels import Backend, GridLayout, Samples, grid_layout
 from nerf.kernels.torch.adam import BETA1, BETA2, EPSILON
@@ -132,13 +132,13 @@ def _sigma_backward(backend: Backend, grad: Tensor, logarithm: Tensor) -> tuple[
     return (grad_geometry_features[:, :1],)
 
 
-def _density(_: Backend, features: Tensor) -> Tensor:
-    return mlp.density_forward(_weights(features), features).geometry_features
+def _density(backend: Backend, features: Tensor) -> Tensor:
+    return mlp.density_forward(_weights(features), backend, features).geometry_features
 
 
 def _density_backward(backend: Backend, grad: Tensor, features: Tensor) -> tuple[Tensor]:
     weights = _weights(features)
-    done = mlp.density_forward(weights, features)
+    done = mlp.density_forward(weights, backend, features)
     none = torch.zeros_like(features[:, 0])
     return (mlp.density_backward(weights, backend, done, none, grad.clone()).features,)
 
@@ -157,15 +157,17 @@ def _each(like: Tensor) -> Samples:
 def _colour(backend: Backend, geometry_features: Tensor, harmonics: Tensor) -> Tensor:
     weights = _weights(geometry_features)
     ray_hidden = mlp.direction_hidden(weights, harmonics)
-    return mlp.colour_forward(weights, backend, _each(geometry_features), geometry_features, ray_hidden).colour
+    return mlp.colour_forward(weights, backend, _each(geometry_features).ray, geometry_features, ray_hidden)
 
 
 def _colour_backward(
     backend: Backend, grad: Tensor, geometry_features: Tensor, harmonics: Tensor
 ) -> tuple[Tensor, Tensor]:
     weights, samples = _weights(geometry_features), _each(geometry_features)
-    done = mlp.colour_forward(weights, backend, samples, geometry_features, mlp.direction_hidden(weights, harmonics))
-    gradients = mlp.colour_backward(weights, backend, samples, done, harmonics, grad)
+    ray_hidden = mlp.direction_hidden(weights, harmonics)
+    colour = mlp.colour_forward(weights, backend, samples.ray, geometry_features, ray_hidden)
+    done = ColourPass(harmonics, ray_hidden, colour)
+    gradients = mlp.colour_backward(weights, backend, samples, geometry_features, done, grad)
     return gradients.geometry_features, gradients.harmonics
 
 
@@ -315,7 +317,7 @@ CASES = [
     ),
     Case(
         formula="density network: matrix products and ReLU",
-        where="nerf/fields/mlp.py: density_forward, density_backward",
+        where="nerf/kernels/torch/mlp.py: mlp_forward, mlp_backward",
         typical=lambda: (uniform(1, -1, 1, 256, FEATURES),),
         extreme=lambda: (uniform(2, -1, 1, 5, FEATURES) * torch.tensor([[1e-4], [1e-38], [0], [1e30], [1e10]]),),
         function=_density,

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 from nerf.effects import ImageEffects
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
-from nerf.kernels import HIDDEN
 from nerf.geometry.space_maps import Box, Contraction, Ndc, SpaceMap
+from nerf.kernels import HIDDEN
 from nerf.training.graph_trainer import GraphTrainer
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from stages.contract import Progress

@@ -7,11 +7,11 @@ import numpy as np
 import torch
 
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
-from nerf.kernels import HIDDEN
 from nerf.geometry.scene import Scene
 from nerf.geometry.space_maps import Box, SpaceMap
 from nerf.geometry.space_maps.contraction import Contraction
 from nerf.geometry.space_maps.ndc import Ndc
+from nerf.kernels import HIDDEN
 from nerf.kernels.torch.occupancy import cell_corners
 from nerf.runtime.randomness import generator
 from stages.hardware.backend import load_backend

@@ -19,8 +19,9 @@ OPTIONS = ["-n", "0", "-k", "not first_use", "-p", "no:cacheprovider"]  # worker
 TESTED = f"import pytest; raise SystemExit(pytest.main({TESTS + OPTIONS}))"
 BEYOND = """
 import torch
-from nerf.kernels import warp
-warp.relu_backward(torch.ones(2, 64), torch.ones(1, 64))
+from nerf.kernels.warp.launch import launch
+from nerf.kernels.warp.mlp import _relu_backward_gpu
+launch(_relu_backward_gpu, 32, torch.ones(2, 64), torch.ones(1, 64))
 """
 
 

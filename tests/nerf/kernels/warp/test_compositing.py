@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from nerf.fields.interface import Rendering
-from nerf.kernels import Backend, RayStepping, Samples, warp
+from nerf.kernels import Backend, Layers, RayStepping, Samples, warp
 from nerf.kernels import torch as reference
 from tests.nerf.kernels.agreement import (
     COUNTS,
@@ -79,11 +79,9 @@ def test_other_sums_along_rays_of_4096_samples(device: str, varied: bool) -> Non
     for stepping in (EVEN, GROWING):
         agree("depth_loss", samples, weights, opacity, rays.far, distance, stepping, tolerance=1e-6)
         agree("depth_loss_backward", samples, rays.far, distance, stepping, normal(device, 23, 3), tolerance=1e-6)
-    hidden = (0.1 * each[:, None] - 0.06).relu().repeat(1, 64)
-    given = 0.1 * each[:, None].repeat(1, 64)
-    wanted = given.double()
-    ray_hidden = warp.add_ray_relu_backward(samples, hidden, given)
-    assert relative_error(ray_hidden, reference.add_ray_relu_backward(samples, hidden.double(), wanted)) < 5e-6
+    layers, given = Layers(normal(device, 24, 4, 64), normal(device, 25, 3, 64)), 0.1 * each[:, None]
+    inputs, ray_hidden = given.repeat(1, 4) - 0.06, torch.zeros(3, 64, device=device)
+    agree("mlp_backward", layers, inputs, given.repeat(1, 3), samples, ray_hidden, tolerance=5e-6)
 
 
 @pytest.mark.parametrize("varied", [False, True])
@@ -112,11 +110,6 @@ def test_what_is_done_to_each_of_4096_samples(device: str, varied: bool) -> None
     for thin in (0.0, 0.01):
         kept, _ = agree("visible_samples", samples, each, 0.2, thin, uniform(device, 33, 3), tolerance=1e-6)
         assert kept.starts.diff().min() > (100 if thin else 1000) and len(kept.t) < len(each) / 2
-    hidden, ray_hidden = normal(device, 27, len(each), 64), normal(device, 29, 3, 64)
-    given, wanted = hidden.clone(), hidden.clone()
-    warp.add_ray_relu(samples, given, ray_hidden)
-    reference.add_ray_relu(samples, wanted, ray_hidden)
-    assert torch.equal(given, wanted)
     rounds, _ = agree("pack_rounds", [samples, packed(device, [4096, 0, 1])])
     assert rounds.starts.diff().tolist() == [8192, 4096, 4097]
 

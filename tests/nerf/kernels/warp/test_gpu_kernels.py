@@ -2,11 +2,13 @@
 
 from typing import Any
 
+import pytest
 import torch
 
-from nerf.kernels import grid_layout, warp
+from nerf.kernels import Layers, grid_layout, warp
 from nerf.kernels.torch.adam import BETA1, BETA2
-from nerf.kernels.warp import encoding, gather, hidden_layer
+from nerf.kernels.torch.mlp import BLOCK, backward_in_blocks, forward_in_blocks
+from nerf.kernels.warp import encoding, gather, mlp
 from nerf.kernels.warp.adam import _adam4
 from nerf.kernels.warp.launch import launch
 from tests.nerf.kernels.agreement import normal, packed, uniform
@@ -36,20 +38,20 @@ def test_gradients_of_the_table() -> None:
     assert wanted.any() and not wanted[: LAYOUT.level_offsets[1]].any()
 
 
-def test_hidden_layer() -> None:
+@pytest.mark.parametrize("block", [1 << 22, 16])
+def test_networks(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(BLOCK, "cpu", block)
     samples, of_ray = packed("cpu", COUNTS), normal("cpu", 3, len(COUNTS), 64)
-    hidden, grad = normal("cpu", 4, len(samples.t), 64), normal("cpu", 5, len(samples.t), 64)
-    hidden[5, 7] = torch.nan
-    by_gpu_kernel, its_grad = hidden.clone(), grad.clone()
-    warp.add_ray_relu(samples, hidden, of_ray)
-    run(hidden_layer._add_ray_relu_gpu, 16 * len(hidden), samples.ray, of_ray, by_gpu_kernel)
-    torch.testing.assert_close(by_gpu_kernel, hidden, rtol=0, atol=0, equal_nan=True)
-    hidden[5, 7] = 1.0
-    wanted, found = warp.add_ray_relu_backward(samples, hidden, grad), torch.empty(len(COUNTS), 64)
-    run(hidden_layer._add_ray_relu_backward_gpu, 16 * len(found), samples.starts, hidden, its_grad, found)
-    torch.testing.assert_close((found, its_grad), (wanted, grad))
-    run(hidden_layer._relu_backward_gpu, 16 * len(hidden), hidden, (again := normal("cpu", 5, len(hidden), 64)))
-    torch.testing.assert_close(again, grad)
+    layers = Layers(normal("cpu", 4, 20, 64), normal("cpu", 5, 3, 64))
+    inputs, grad = normal("cpu", 6, len(samples.t), 20), normal("cpu", 7, len(samples.t), 3)
+    forward, backward = mlp._hidden_layer_gpu, mlp._hidden_layer_backward_gpu
+    for ray, given in ((samples, of_ray), (None, None)):
+        found = forward_in_blocks(forward, layers, inputs, ray and ray.ray, given)
+        torch.testing.assert_close(found, warp.mlp_forward(layers, inputs, ray and ray.ray, given))
+        gradients = backward_in_blocks(forward, backward, layers, inputs, grad, ray, given)
+        torch.testing.assert_close(gradients, warp.mlp_backward(layers, inputs, grad, ray, given), rtol=1e-4, atol=1e-4)
+    inputs[5, 7] = torch.nan
+    assert forward(layers, inputs, samples.ray, of_ray)[5].isnan().all()
 
 
 def test_adam() -> None:

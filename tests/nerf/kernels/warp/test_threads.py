@@ -16,7 +16,7 @@ from torch import Tensor
 
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
-from nerf.kernels import RayStepping, grid_layout, warp
+from nerf.kernels import Layers, RayStepping, grid_layout, warp
 from nerf.kernels.torch.occupancy import binary_occupancy
 from nerf.runtime.parallel import take_over_cores
 
@@ -75,11 +75,11 @@ def everything(seed: int) -> list[Tensor]:
     warp.accumulate_colours(drawn, colour.index_select(0, drawn.rows), seen)
     harmonics = warp.spherical_harmonics(directions)
     grad_directions = warp.spherical_harmonics_backward(directions, harmonics)
-    hidden = torch.randn(len(samples.t), 64, generator=random)
-    warp.add_ray_relu(samples, hidden, torch.randn(count, 64, generator=random))
-    grad_hidden, grad_rectified = hidden.clone(), hidden + 1
-    ray_hidden = warp.add_ray_relu_backward(samples, hidden, grad_hidden)
-    warp.relu_backward(hidden, grad_rectified)
+    layers = Layers(*(torch.randn(size, 64, generator=random) for size in (layout.width, 3)))
+    ray_hidden = torch.randn(count, 64, generator=random)
+    logits = warp.mlp_forward(layers, features, samples.ray, ray_hidden)
+    grad_layers = warp.mlp_backward(layers, features, logits, samples, ray_hidden)
+    assert grad_layers.ray_hidden is not None
     adam = [torch.randn(layout.rows, 4, generator=random), grad_table.clone(), grad_table.clone(), grad_table.abs()]
     warp.adam(adam[0], adam[1], adam[2], adam[3], 1e-2, 3)
     thickness = torch.rand(512, generator=random)
@@ -88,7 +88,7 @@ def everything(seed: int) -> list[Tensor]:
         *(bits, *samples, points, features, grad_table, grad_points, *grad_rays, *front, kept, *rendering, weights),
         *(*grad_field, spread, grad_weights, apart, *grad_apart, depth, near, *rounds, order),
         *(*drawn.samples, drawn.rows, drawn.weights, drawn_depth, shown, seen),
-        *(harmonics, grad_directions, hidden, grad_hidden, grad_rectified, ray_hidden, *adam, thickness),
+        *(harmonics, grad_directions, logits, *grad_layers[:3], grad_layers.ray_hidden, *adam, thickness),
     ]
 
 

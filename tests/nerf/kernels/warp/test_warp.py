@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.kernels import Backend, grid_layout, warp
+from nerf.kernels import Backend, Layers, grid_layout, warp
 from nerf.kernels import torch as reference
 from nerf.kernels.warp import occupancy
 from nerf.kernels.warp.launch import launch
@@ -25,7 +25,6 @@ from tests.nerf.kernels.agreement import (
     TOLERANCE,
     agree,
     assert_each_close,
-    doubled,
     normal,
     occupied_of,
     packed,
@@ -121,38 +120,37 @@ def test_spherical_harmonics(device: str, rays: int) -> None:
     agree("spherical_harmonics", torch.nn.functional.normalize(normal(device, 22, rays, 3), dim=-1))
 
 
-# The hidden layer
+# Networks
 
 
-def hidden_of(device: str) -> Tensor:
-    """With zeros of both signs and the smallest and largest numbers of float32."""
-    hidden = normal(device, 27, sum(COUNTS), 64)
-    extremes = torch.tensor([0.0, -0.0, 1e-45, -1e-45, 1e-38, 3e38, -3e38, 1e-20])
-    return torch.where(uniform(device, 28, *hidden.shape) < 0.5, extremes.repeat(8), hidden)
-
-
-def test_the_hidden_layer(device: str) -> None:
-    samples, hidden = packed(device, COUNTS), hidden_of(device)
-    ray_hidden = normal(device, 29, len(COUNTS), 64)
+@pytest.mark.parametrize("outputs", [3, 16, 17])
+@pytest.mark.parametrize("inputs", [4, 16, 20, 32, 36])
+def test_networks_and_their_gradients(device: str, inputs: int, outputs: int) -> None:
+    samples, layers = packed(device, COUNTS), Layers(normal(device, 27, inputs, 64), normal(device, 28, outputs, 64))
+    ray_hidden, count = normal(device, 29, len(COUNTS), 64), sum(COUNTS)
     ray_hidden[5:8, ::2] = 0
-    given, wanted = hidden.clone(), hidden.clone()
-    warp.add_ray_relu(samples, given, ray_hidden)
-    reference.add_ray_relu(samples, wanted, ray_hidden)
-    assert torch.equal(given, wanted) and 0.2 < (given > 0).float().mean() < 0.8
+    given, grad = normal(device, 30, count, inputs), normal(device, 26, count, outputs)
+    for first in (0, count - 1, count - 48, count - 49, count - 7):
+        agree("mlp_forward", layers, given[first:])
+        agree("mlp_forward", layers, given[first:], samples.ray.flip(0)[first:], ray_hidden)
+        assert warp.mlp_backward(layers, given[first:], grad[first:]).ray_hidden is None
+        without_rays = (
+            function(layers, given[first:], grad[first:])[:3]
+            for function in (warp.mlp_backward, reference.mlp_backward)
+        )
+        for found, wanted in zip(*without_rays, strict=True):
+            assert relative_error(found, wanted.double()) < TOLERANCE
+    agree("mlp_backward", layers, given, grad, samples, ray_hidden)
 
 
-@pytest.mark.parametrize("function", ["add_ray_relu_backward", "relu_backward"])
-def test_gradients_of_the_hidden_layer(device: str, function: str) -> None:
-    samples, hidden = packed(device, COUNTS), hidden_of(device).relu()
-    grad = normal(device, 30, *hidden.shape)
-    given, wanted = grad.clone(), grad.double()
-    arguments = (samples,) if function == "add_ray_relu_backward" else ()
-    ray_hidden = getattr(warp, function)(*arguments, hidden, given)
-    right = getattr(reference, function)(*doubled((*arguments, hidden)), wanted)
-    assert torch.equal(given, torch.where(hidden > 0, grad, 0))
-    assert (hidden[hidden > 0].min() < 1e-44) and torch.equal(given.double(), wanted)
-    if right is not None:
-        assert relative_error(ray_hidden, right) < TOLERANCE
+def test_what_is_not_positive_has_no_gradient(device: str) -> None:
+    """Zeros of both signs and the smallest and largest numbers of float32, each in hidden units of its own."""
+    units = torch.tensor([0.0, -0.0, 1e-45, -1e-45, 1e-38, 3e38, -3e38, 1e-20], device=device).repeat(8)
+    layers = Layers(torch.stack([units, *torch.zeros(3, 64, device=device)]), torch.ones(4, 64, device=device))
+    inputs = torch.tensor([[1.0, 0, 0, 0]], device=device).repeat(50, 1)
+    found = warp.mlp_backward(layers, inputs, torch.ones(50, 4, device=device))
+    assert torch.equal(found.hidden[0], 200.0 * (units > 0)) and not found.hidden[1:].any()
+    assert torch.equal(warp.mlp_forward(layers, 0 * inputs), torch.zeros(50, 4, device=device))
 
 
 # Adam
@@ -288,10 +286,9 @@ def test_no_rays_and_no_samples_are_fine_even_at_first(device: str, rays: int) -
         rendering, _ = agree("composite", *inputs)
         assert torch.equal(rendering.colour, few.directions) and torch.equal(rendering.depth, few.far)
         agree("composite_backward", *inputs, rendering, empty)
-        hidden = torch.zeros(0, 64, device=device)
-        warp.add_ray_relu(samples, hidden, torch.ones(rays, 64, device=device))
-        assert not warp.add_ray_relu_backward(samples, hidden, hidden).any()
-        warp.relu_backward(hidden, hidden)
+        layers, ray_hidden = Layers(*torch.ones(2, 3, 64, device=device)), torch.ones(rays, 64, device=device)
+        agree("mlp_forward", layers, none, samples.ray, ray_hidden)
+        assert not any(each.any() for each in agree("mlp_backward", layers, none, none, samples, ray_hidden))
         warp.scatter_max(4, torch.ones(64, device=device), none, empty)
 
     on_a_new_thread(everything)
