@@ -141,7 +141,7 @@ class HashGridPass(NamedTuple):
     """What a rendering computed on its way, for :meth:`HashGridField.backward`. ``capacities`` are those that it was
     given, or just needed; ``fits``: whether they sufficed. ``density_evaluations``: how many points the density was
     evaluated at. ``optical_thickness`` is that of the samples' own intervals, before thinning. ``samples`` stand at
-    distances along the ``mapped`` rays, for lengths in the scene."""
+    distances along the ``mapped`` rays, for lengths in the scene, and ``in_scene`` at their distances there."""
 
     rays: Rays
     mapped: MappedRays
@@ -150,6 +150,7 @@ class HashGridPass(NamedTuple):
     density_evaluations: Int32[Tensor, ""]
     fits: Bool[Tensor, ""]
     samples: Samples
+    in_scene: Samples
     points: Float[Tensor, "samples 3"]
     optical_thickness: Float[Tensor, "samples"]
     density: DensityPass
@@ -318,11 +319,11 @@ class HashGridField(nn.Module):
             ray_hidden = mlp.direction_hidden(self.weights, harmonics)
         colour = mlp.colour_forward(self.weights, backend, samples.ray, density.geometry_features, ray_hidden)
         with span("composite"):
-            of_scene = _in_scene(mapped, samples)
-            rendering, weights = backend.composite(of_scene, density.sigma, colour, background, rays.far)
+            in_scene = _in_scene(mapped, samples)
+            rendering, weights = backend.composite(in_scene, density.sigma, colour, background, rays.far)
         needed = SampleCapacities(tuple(RoundSize(each.per_ray, len(each.points)) for each in rounds), len(points))
         fits = jitter.new_ones((), dtype=torch.bool) if capacities is None else self._fits(rounds, samples)
-        of_samples = samples, points, optical_thickness, density
+        of_samples = samples, in_scene, points, optical_thickness, density
         counted = needed, marched.starts[-1], fits
         of_colour = ColourPass(harmonics, ray_hidden, colour)
         return HashGridPass(rays, mapped, background, *counted, *of_samples, of_colour, rendering, weights)
@@ -340,7 +341,7 @@ class HashGridField(nn.Module):
         """Gradients of a loss, given those of the rendering and of the samples' weights."""
         backend, density, colour = self.backend, forward_pass.density, forward_pass.colour
         grad_sigma, grad_colour = backend.composite_backward(
-            _in_scene(forward_pass.mapped, forward_pass.samples),
+            forward_pass.in_scene,
             density.sigma,
             colour.colour,
             forward_pass.background,
@@ -360,7 +361,7 @@ class HashGridField(nn.Module):
         self, forward_pass: HashGridPass, gradients: HashGridGradients
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
         """Gradients of the rays' origins and directions, for refining poses."""
-        backend, rays, samples = self.backend, forward_pass.rays, _in_scene(forward_pass.mapped, forward_pass.samples)
+        backend, rays, samples = self.backend, forward_pass.rays, forward_pass.in_scene
         grad_points = backend.encode_backward_points(self.layout, self.table, forward_pass.points, gradients.features)
         if isinstance(self.space, Ndc):
             points = rays.origins[samples.ray] + samples.t[:, None] * rays.directions[samples.ray]

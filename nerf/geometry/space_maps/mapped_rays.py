@@ -31,7 +31,9 @@ class MappedRays(NamedTuple):
         """Distances in the scene of those along ``rays``: (rays, n), or packed ones with the ``ray`` of each."""
         if self.line is None:
             return t
-        start, depth, slope, speed = (each[..., None] if ray is None else each[ray] for each in self.line)
+        start, depth, slope, speed = (
+            each[..., None] if ray is None else each.index_select(0, ray) for each in self.line
+        )
         share = t / speed
         return start + share * depth / (1 - share * slope).clamp(min=MIN_REST)
 
@@ -41,7 +43,7 @@ class MappedRays(NamedTuple):
         """Length in the scene for a length along ``rays`` at packed samples: the derivative of :meth:`to_scene`."""
         if self.line is None:
             return 1.0
-        _, depth, slope, speed = (each[ray] for each in self.line)
+        depth, slope, speed = (each.index_select(0, ray) for each in self.line[1:])
         return depth / (speed * (1 - t / speed * slope).clamp(min=MIN_REST).square())
 
     def from_scene(self, distance: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
