@@ -6,7 +6,7 @@ from stages.contract import Flexible, Inputs, Progress, StageResult, Workload
 from stages.train.config import Config
 
 INPUTS = ("ingest", "normalise", "effects")
-VERSION = 29
+VERSION = 30
 EXIT_CODE = 14
 RESUMES = True
 PUBLISHED = ("curve.json",)

@@ -17,7 +17,7 @@ from stages.train.fields.field_list import field_of
 
 def chosen_precision(config: Config, progress: Progress) -> Precision:
     """For the products of a training whose field and sizes of networks are known; "medium" is said."""
-    if config.steps is not None:
+    if config.steps is not None or not field_of(config).multiplies_by_torch(config):
         return "highest"
     medium = _medium(config)
     if not medium.is_worthwhile:
@@ -32,7 +32,8 @@ def chosen_precision(config: Config, progress: Progress) -> Precision:
 
 def say_if_inexact(config: Config, progress: Progress) -> None:
     """Where a precision that was asked for, or chosen on another machine, means less here."""
-    if config.matmul == "medium" and not (medium := _medium(config)).is_exact:
+    concerned = config.matmul == "medium" and field_of(config).multiplies_by_torch(config)
+    if concerned and not (medium := _medium(config)).is_exact:
         progress.note(
             "train.matmul-inexact",
             f"matrix multiplications have an error of {medium.error:.0e} here; --train.matmul highest makes them exact",
@@ -40,7 +41,9 @@ def say_if_inexact(config: Config, progress: Progress) -> None:
 
 
 def precision_facts(config: Config) -> dict[str, Any]:
-    """For the manifest: the precision, and what "medium" is on this machine."""
+    """For the manifest: the precision, and what "medium" is on this machine, where torch multiplies."""
+    if not field_of(config).multiplies_by_torch(config):
+        return {"matmul": config.matmul}
     medium = _medium(config)
     return {
         "matmul": config.matmul,

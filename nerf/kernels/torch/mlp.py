@@ -44,8 +44,8 @@ def mlp_forward(
     ray: Int32[Tensor, "samples"] | None = None,
     ray_hidden: Float[Tensor, "rays hidden"] | None = None,
 ) -> Float[Tensor, "samples outputs"]:
-    """The outputs; ``ray_hidden`` is added to the hidden layers of the samples of each ``ray``."""
-    return forward_in_blocks(hidden_layer, layers, inputs, ray, ray_hidden)
+    """The outputs; row ``ray`` of ``ray_hidden`` is added to a sample's hidden layer."""
+    return forward_in_blocks(hidden_layer, layers, inputs, ray, ray_hidden, BLOCK[inputs.device.type])
 
 
 def mlp_backward(
@@ -55,8 +55,10 @@ def mlp_backward(
     samples: Samples | None = None,
     ray_hidden: Float[Tensor, "rays hidden"] | None = None,
 ) -> MlpGradients:
-    """Gradients of the layers and of what went into them, given that of the outputs."""
-    return backward_in_blocks(hidden_layer, hidden_layer_backward, layers, inputs, grad, samples, ray_hidden)
+    """Gradients of the layers and of what went into them, given that of the outputs. ``samples``, packed, tell whose
+    rays' rows were added: both are given or neither."""
+    block = BLOCK[inputs.device.type]
+    return backward_in_blocks(hidden_layer, hidden_layer_backward, layers, inputs, grad, samples, ray_hidden, block)
 
 
 def forward_in_blocks(
@@ -65,10 +67,11 @@ def forward_in_blocks(
     inputs: Float[Tensor, "samples inputs"],
     ray: Int32[Tensor, "samples"] | None,
     ray_hidden: Float[Tensor, "rays hidden"] | None,
+    block: int,
 ) -> Float[Tensor, "samples outputs"]:
-    """What :func:`mlp_forward` says, by any function of the hidden layer."""
+    """What :func:`mlp_forward` says, by any function of the hidden layer, so many samples at a time."""
     outputs = inputs.new_empty(len(inputs), len(layers.out))
-    for rows in _blocks(inputs):
+    for rows in _blocks(inputs, block):
         hidden = hidden_of(layers, inputs[rows], None if ray is None else ray[rows], ray_hidden)
         torch.mm(hidden, layers.out.T, out=outputs[rows])
     return outputs
@@ -82,15 +85,13 @@ def backward_in_blocks(
     grad: Float[Tensor, "samples outputs"],
     samples: Samples | None,
     ray_hidden: Float[Tensor, "rays hidden"] | None,
+    block: int,
 ) -> MlpGradients:
-    """What :func:`mlp_backward` says, by any functions of the hidden layer."""
-    of_hidden, of_out, of_inputs = (
-        torch.zeros_like(layers.hidden),
-        torch.zeros_like(layers.out),
-        torch.empty_like(inputs),
-    )
-    of_rays = None if ray_hidden is None else torch.zeros_like(ray_hidden)
-    for rows in _blocks(inputs):
+    """What :func:`mlp_backward` says, by any functions of the hidden layer, so many samples at a time."""
+    assert (samples is None) == (ray_hidden is None), "rays are given or not"
+    of_hidden, of_out = torch.zeros_like(layers.hidden), torch.zeros_like(layers.out)
+    of_inputs, of_rays = torch.empty_like(inputs), None if ray_hidden is None else torch.zeros_like(ray_hidden)
+    for rows in _blocks(inputs, block):
         hidden = hidden_of(layers, inputs[rows], None if samples is None else samples.ray[rows], ray_hidden)
         grad_hidden = grad[rows] @ layers.out
         hidden_backward(hidden, grad_hidden, samples, rows, of_rays)
@@ -128,7 +129,6 @@ def hidden_layer_backward(
         grad_of_rays.index_add_(0, samples.ray[rows].long(), grad)
 
 
-def _blocks(samples: Float[Tensor, "samples _"]) -> Iterator[slice]:
-    """All samples, BLOCK at a time."""
-    size = BLOCK[samples.device.type]
+def _blocks(samples: Float[Tensor, "samples _"], size: int) -> Iterator[slice]:
+    """All samples, so many at a time."""
     return (slice(first, min(first + size, len(samples))) for first in range(0, len(samples), size))

@@ -21,6 +21,7 @@ wp.config.enable_tiles_in_stack_memory = None
 wp.init()
 
 Argument = Tensor | int | float
+MAX_ENTRIES = 2**31 - 1  # of an array: Warp counts them in 32 bits
 
 TORCH_TYPES = {
     wp.float32: torch.float32,
@@ -92,6 +93,8 @@ def launch(kernel: wp.Kernel, count: int, *arguments: Argument) -> None:
             entries, rest = divmod(argument.numel(), array.numbers)
             if rest:
                 raise TypeError(_unreadable(kernel, place, array, device, argument))
+            if entries > MAX_ENTRIES:
+                raise TypeError(f"{kernel.key}: {kernel.adj.args[place - 1].label} has {entries:,} entries, too many")
             entry = ready.params[place]
             entry.data, entry.shape[0] = argument.data_ptr(), entries
         elif array is None:

@@ -9,17 +9,18 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from nerf.kernels import HIDDEN, Layers, MlpGradients, Samples
-from nerf.kernels.torch.mlp import backward_in_blocks, forward_in_blocks
+from nerf.kernels.torch.mlp import BLOCK, backward_in_blocks, forward_in_blocks
 from nerf.kernels.warp.launch import launch
 
 wp.set_module_options({"enable_backward": False})
 
 TILE = 48  # samples, a multiple of both groups below: their hidden layer and its gradient take 24 KB
-MAX_LANES = 16  # numbers in the widest vectors of any CPU
-# Of four numbers in a row. On a GPU each has a thread: neighbouring threads should touch neighbouring memory.
-VECTORS = 16
-# Samples whose gradients are summed by themselves before they join their ray's: of n numbers one after the other, in
-# float32, up to n half ulps are lost, here 64 + 64 for a ray of 4096. Sums in float64 take twice the vectors.
+MAX_LANES = 16  # numbers in a vector of AVX-512, the widest used here
+# Of four numbers in a hidden layer. On a GPU each has a thread: neighbouring threads should touch neighbouring memory.
+_VEC4_PER_ROW = HIDDEN // 4
+# Samples whose gradients a GPU sums by themselves before they join their ray's, as a tile's are on a CPU: of n numbers
+# one after the other, in float32, up to n half ulps are lost, here 64 + 64 for a ray of 4096. Sums in float64 take
+# twice the vectors.
 _PARTIAL_SUM = wp.constant(64)
 
 
@@ -31,11 +32,11 @@ def mlp_forward(
 ) -> Float[Tensor, "samples outputs"]:
     """As in nerf.kernels.torch.mlp."""
     if inputs.is_cuda:
-        return forward_in_blocks(_hidden_layer_gpu, layers, inputs, ray, ray_hidden)
+        return forward_in_blocks(_hidden_layer_gpu, layers, inputs, ray, ray_hidden, BLOCK["cuda"])
     count, width = inputs.shape
-    outputs, rays = inputs.new_empty(count, len(layers.out)), _of_rays(inputs, ray, ray_hidden)
-    sizes = width, layers.hidden, *rays, _padded_columns(layers.out), len(layers.out)
-    launch(_mlp_forward, -(-count // TILE), inputs, *sizes, outputs)
+    outputs, rays = inputs.new_empty(count, len(layers.out)), _rays_or_empty(inputs, ray, ray_hidden)
+    arguments = width, layers.hidden, *rays, _padded_columns(layers.out), len(layers.out)
+    launch(_mlp_forward, -(-count // TILE), inputs, *arguments, outputs)
     return outputs
 
 
@@ -48,18 +49,19 @@ def mlp_backward(
 ) -> MlpGradients:
     """As in nerf.kernels.torch.mlp."""
     if inputs.is_cuda:
-        given = layers, inputs, grad, samples, ray_hidden
+        given = layers, inputs, grad, samples, ray_hidden, BLOCK["cuda"]
         return backward_in_blocks(_hidden_layer_gpu, _hidden_layer_backward_gpu, *given)
+    assert (samples is None) == (ray_hidden is None), "rays are given or not"
     count, width = inputs.shape
-    rays = _of_rays(inputs, None if samples is None else samples.ray, ray_hidden)
+    rays = _rays_or_empty(inputs, None if samples is None else samples.ray, ray_hidden)
     of_layers, of_inputs = (torch.zeros_like(layers.hidden), torch.zeros_like(layers.out)), torch.empty_like(inputs)
     of_rays = torch.zeros_like(rays[1])
-    weights = width, layers.hidden, _padded_columns(layers.hidden), *rays, len(layers.out), layers.out
-    launch(_mlp_backward, -(-count // TILE), inputs, *weights, grad, of_inputs, *of_layers, of_rays)
+    arguments = width, layers.hidden, _padded_columns(layers.hidden), *rays, len(layers.out), layers.out
+    launch(_mlp_backward, -(-count // TILE), inputs, *arguments, grad, of_inputs, *of_layers, of_rays)
     return MlpGradients(*of_layers, of_inputs, None if ray_hidden is None else of_rays)
 
 
-def _of_rays(inputs: Tensor, ray: Tensor | None, ray_hidden: Tensor | None) -> tuple[Tensor, Tensor]:
+def _rays_or_empty(inputs: Tensor, ray: Tensor | None, ray_hidden: Tensor | None) -> tuple[Tensor, Tensor]:
     """Each sample's ray and what rays add, empty where they add nothing."""
     if ray is None or ray_hidden is None:
         return inputs.new_empty(0, dtype=torch.int32), inputs.new_empty(0, HIDDEN)
@@ -75,8 +77,9 @@ def _padded_columns(weights: Float[Tensor, "rows hidden"]) -> Float[Tensor, "hid
 
 
 # In C++, for sums that stay in registers: a dozen of them take turns, so that none waits for its own last addition, and
-# each weight that is read serves a group of samples.
-_VECTORS = (
+# each weight that is read serves a group of samples. Products and sums are fused. ``loose`` is a vector anywhere in
+# memory.
+_CPU_COMMON = (
     f"""
 #ifndef __CUDA_ARCH__
 #pragma clang fp contract(fast)
@@ -90,28 +93,30 @@ _VECTORS = (
 #endif
     typedef float vec __attribute__((vector_size(4 * LANES)));
     typedef float loose __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
+    static_assert(HIDDEN % (4 * LANES) == 0 && TILE % GROUP == 0 && TILE % LONG_GROUP == 0, "whole vectors and groups");
     const int total = inputs.shape[0] / width, first = tile * TILE, count = wp::min(TILE, total - first);
+    const int filled = (count + LONG_GROUP - 1) / LONG_GROUP * LONG_GROUP;  // rows behind the last repeat it
     const float* const x = inputs.data + (long long)first * width;
     const bool with_rays = rays.shape[0] > 0;
     assert(tile >= 0 && count > 0 && inputs.shape[0] == total * width && hidden_weights.shape[0] == width * HIDDEN);
     assert(!with_rays || rays.shape[0] == total);
     for (int s = 0; with_rays && s < count; ++s)
-        assert(rays.data[first + s] >= 0 && (rays.data[first + s] + 1) * HIDDEN <= ray_hidden.shape[0]);
+        assert(rays.data[first + s] >= 0 && rays.data[first + s] < ray_hidden.shape[0] / HIDDEN);
 
-    const auto aligned = [](int size) { return (size + MAX_LANES - 1) / MAX_LANES * MAX_LANES; };
+    const auto aligned = [](int columns) { return (columns + MAX_LANES - 1) / MAX_LANES * MAX_LANES; };
     // What a group's rays add to columns j ... of their hidden layer; nothing without rays.
-    const auto begin = [&](int s, int j, vec sum[GROUP][2]) {
+    const auto start_sums = [&](int s, int j, vec sum[GROUP][2]) {
         for (int i = 0; i < GROUP; ++i)
             for (int v = 0; v < 2; ++v)
                 sum[i][v] = with_rays ? (vec)*(const loose*)(ray_hidden.data + j + v * LANES +
                     (long long)rays.data[first + wp::min(s + i, count - 1)] * HIDDEN) : vec{};
     };
-    // sum += rows times weights (size, HIDDEN), for a group of rows and columns j ...
-    const auto multiply = [&](const float* rows, int size, const float* weights, int s, int j, vec sum[GROUP][2]) {
+    // sum += rows times weights (row_size, HIDDEN), for a group of rows and columns j ...
+    const auto multiply = [&](const float* rows, int row_size, const float* weights, int s, int j, vec sum[GROUP][2]) {
         const float* row[GROUP];
         for (int i = 0; i < GROUP; ++i)
-            row[i] = rows + wp::min(s + i, count - 1) * size;
-        for (int k = 0; k < size; ++k) {
+            row[i] = rows + wp::min(s + i, count - 1) * row_size;
+        for (int k = 0; k < row_size; ++k) {
             const vec a = *(const loose*)(weights + k * HIDDEN + j);
             const vec b = *(const loose*)(weights + k * HIDDEN + j + LANES);
             for (int i = 0; i < GROUP; ++i) {
@@ -120,11 +125,11 @@ _VECTORS = (
             }
         }
     };
-    // Rows of a tile (TILE, HIDDEN) times columns (HIDDEN, padded), the first ``size`` of which are kept.
-    const auto multiply_columns = [&](const float* rows, const float* columns, int size, float* target) {
-        const int padded = aligned(size);
+    // Rows of a tile (TILE, HIDDEN) times ``wanted`` columns of (HIDDEN, padded).
+    const auto multiply_columns = [&](const float* rows, const float* columns, int wanted, float* target) {
+        const int padded = aligned(wanted);
         for (int s = 0; s < count; s += LONG_GROUP)
-            for (int j = 0; j < size; j += LANES) {
+            for (int j = 0; j < wanted; j += LANES) {
                 vec sum[LONG_GROUP];
                 for (int i = 0; i < LONG_GROUP; ++i)
                     sum[i] = vec{};
@@ -133,9 +138,9 @@ _VECTORS = (
                     for (int i = 0; i < LONG_GROUP; ++i)
                         sum[i] += rows[(s + i) * HIDDEN + k] * column;
                 }
-                const int kept = wp::min(LANES, size - j);
+                const int kept = wp::min(LANES, wanted - j);
                 for (int i = 0; i < LONG_GROUP && s + i < count; ++i) {
-                    float* const to = target + (s + i) * size + j;
+                    float* const to = target + (s + i) * wanted + j;
                     if (kept == LANES)
                         *(loose*)to = sum[i];
                     else
@@ -144,21 +149,21 @@ _VECTORS = (
                 }
             }
     };
-    // max(y, 0), and NaN for NaN: 0 y changes no finite number.
-    const auto rectified = [](vec y) { return y > 0.0f ? y : 0.0f * y; };
+    // max(y, 0), and NaN for NaN, which is not below 0.
+    const auto rectified = [](vec y) { return y < 0.0f ? vec{} : y; };
 """
 )
 
 
 @wp.func_native(
-    _VECTORS
+    _CPU_COMMON
     + """
     assert(outputs.shape[0] == total * size && columns.shape[0] == HIDDEN * aligned(size));
     alignas(64) float hidden[TILE * HIDDEN];
-    for (int s = 0; s < count; s += GROUP)
+    for (int s = 0; s < filled; s += GROUP)
         for (int j = 0; j < HIDDEN; j += 2 * LANES) {
             vec sum[GROUP][2];
-            begin(s, j, sum);
+            start_sums(s, j, sum);
             multiply(x, width, hidden_weights.data, s, j, sum);
             for (int i = 0; i < GROUP; ++i)
                 for (int v = 0; v < 2; ++v)
@@ -183,7 +188,7 @@ def _forward_tile(
 
 
 @wp.func_native(
-    _VECTORS
+    _CPU_COMMON
     + """
     assert(grad_inputs.shape[0] == total * width && grad.shape[0] == total * size);
     assert(out_weights.shape[0] == size * HIDDEN && columns.shape[0] == HIDDEN * aligned(width));
@@ -191,10 +196,10 @@ def _forward_tile(
     assert(!with_rays || grad_ray_hidden.shape[0] == ray_hidden.shape[0]);
     const float* const dy = grad.data + (long long)first * size;
     alignas(64) float hidden[TILE * HIDDEN], grad_hidden[TILE * HIDDEN];
-    for (int s = 0; s < count; s += GROUP)
+    for (int s = 0; s < filled; s += GROUP)
         for (int j = 0; j < HIDDEN; j += 2 * LANES) {
             vec sum[GROUP][2], back[GROUP][2];
-            begin(s, j, sum);
+            start_sums(s, j, sum);
             multiply(x, width, hidden_weights.data, s, j, sum);
             for (int i = 0; i < GROUP; ++i)
                 back[i][0] = back[i][1] = vec{};
@@ -204,11 +209,12 @@ def _forward_tile(
                     const int place = (s + i) * HIDDEN + j + v * LANES;
                     const vec y = rectified(sum[i][v]);
                     *(loose*)(hidden + place) = y;
-                    *(loose*)(grad_hidden + place) = y > 0.0f ? back[i][v] : 0.0f * y * back[i][v];
+                    *(loose*)(grad_hidden + place) = y > 0.0f ? back[i][v] : y * back[i][v];
                 }
         }
     multiply_columns(grad_hidden, columns.data, width, grad_inputs.data + (long long)first * width);
-    // target (rows' size, HIDDEN) += rows transposed times a tile, two rows of it and half the columns at a time.
+    // target (row_size, HIDDEN) += rows transposed times a tile, two of its rows and four vectors at a time. A tile has
+    // a sum of its own first: adding sample after sample to that of all would lose more digits.
     const auto add_product = [&](const float* rows, int row_size, const float* of_tile, float* target) {
         for (int k = 0; k < row_size; k += 2)
             for (int j = 0; j < HIDDEN; j += 4 * LANES) {
@@ -324,7 +330,7 @@ def _hidden_layer_gpu(
     hidden = inputs @ layers.hidden
     if ray is None or ray_hidden is None:
         return hidden.relu_()
-    launch(_add_ray_relu_gpu, VECTORS * len(hidden), ray, ray_hidden, hidden)
+    launch(_add_ray_relu_gpu, _VEC4_PER_ROW * len(hidden), ray, ray_hidden, hidden)
     return hidden
 
 
@@ -335,9 +341,11 @@ def _hidden_layer_backward_gpu(
     rows: slice,
     grad_of_rays: Float[Tensor, "rays hidden"] | None,
 ) -> None:
-    launch(_relu_backward_gpu, VECTORS * len(hidden), hidden, grad)
-    if samples is not None and grad_of_rays is not None:
-        launch(_add_to_rays_gpu, VECTORS * len(grad_of_rays), samples.starts, rows.start, rows.stop, grad, grad_of_rays)
+    if samples is None or grad_of_rays is None:
+        launch(_relu_backward_gpu, _VEC4_PER_ROW * len(hidden), hidden, grad)
+    else:
+        arguments = samples.starts, rows.start, rows.stop, hidden, grad, grad_of_rays
+        launch(_ray_relu_backward_gpu, _VEC4_PER_ROW * len(grad_of_rays), *arguments)
 
 
 @wp.func
@@ -366,10 +374,15 @@ def _relu_backward_gpu(hidden: wp.array[wp.vec4], grad: wp.array[wp.vec4]):
 
 
 @wp.kernel
-def _add_to_rays_gpu(
-    starts: wp.array[int], first: int, end: int, grad: wp.array[wp.vec4], grad_of_rays: wp.array[wp.vec4]
+def _ray_relu_backward_gpu(
+    starts: wp.array[int],
+    first: int,
+    end: int,
+    hidden: wp.array[wp.vec4],
+    grad: wp.array[wp.vec4],
+    grad_of_rays: wp.array[wp.vec4],
 ):
-    """Of samples ``first`` to ``end`` alone, whose gradients these are."""
+    """Of samples ``first`` to ``end`` alone, whose hidden layers and gradients these are."""
     i = wp.tid()
     ray = i >> 4
     vector = i & 15
@@ -378,6 +391,9 @@ def _add_to_rays_gpu(
     for begin in range(wp.max(starts[ray], first), last, _PARTIAL_SUM):
         partial = wp.vec4(0.0)
         for sample in range(begin, wp.min(begin + _PARTIAL_SUM, last)):
-            partial += grad[16 * (sample - first) + vector]
+            entry = 16 * (sample - first) + vector
+            passed = _relu_gradient(hidden[entry], grad[entry])
+            grad[entry] = passed
+            partial += passed
         total += partial
     grad_of_rays[i] = grad_of_rays[i] + total

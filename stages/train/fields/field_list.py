@@ -57,6 +57,10 @@ class Field(Protocol):
         """Of the matrix multiplications."""
         ...
 
+    def multiplies_by_torch(self, config: Config) -> bool:
+        """Whether torch's precision is that of the matrix multiplications."""
+        ...
+
     def table_rows(self, config: Config) -> int:
         """Rows of features that are read at random, 1 without a table."""
         ...

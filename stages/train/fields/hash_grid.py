@@ -182,6 +182,11 @@ def matmul_width(config: Config) -> int:
     return HIDDEN
 
 
+def multiplies_by_torch(config: Config) -> bool:
+    """Not so by Warp on a CPU: only what a ray's direction takes is left to torch there."""
+    return config.grid.backend != "warp" or compute_device() != "cpu"
+
+
 def table_rows(config: Config) -> int:
     """Rows of features that are read at random."""
     return field_settings(config, background_model=False).layout.rows

@@ -87,6 +87,11 @@ def memory_advice(config: Config) -> tuple[str, str]:
     return why, f"Give a smaller {options}, or fewer cores (taskset)."
 
 
+def multiplies_by_torch(config: Config) -> bool:
+    """All of it."""
+    return True
+
+
 def matmul_width(config: Config) -> int:
     """Of the matrix multiplications."""
     assert config.vanilla.width, "plan() chooses it"

@@ -71,7 +71,6 @@ def encoded_by_autograd(layout: GridLayout, table: Tensor, points: Tensor) -> Te
 @pytest.mark.parametrize("settings", [SMALL, CONTRACTED, OUTDOORS, DIFFUSE, FORWARD])
 def test_all_gradients_are_those_of_autograd(settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nerf.fields.hash_grid.THINNING_THRESHOLD", 0.0)
-    monkeypatch.setattr(mlp, "BLOCK", {"cpu": 7})  # so that there are several, the last one short
     model, given = field(settings), rays()
     jitter = torch.rand(6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     background = torch.rand(6, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)

@@ -62,6 +62,8 @@ def assert_each_close(found: Tensor, wanted: Tensor, floor: float) -> None:
 
 
 def tensors_in(result: Any) -> list[Tensor]:
+    if result is None:
+        return []
     return [result] if isinstance(result, Tensor) else [tensor for part in result for tensor in tensors_in(part)]
 
 

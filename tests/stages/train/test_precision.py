@@ -12,13 +12,14 @@ from stages import train
 from stages.contract import run_stage
 from stages.effects.decisions import Decisions
 from stages.train import Config
+from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.fields.vanilla_options import VanillaOptions
 from stages.train.planning import rays_per_second
 from stages.train.precision import chosen_precision
 from tests.stages.photo_scene import photographed
 
 TINY: dict[str, Any] = {
-    "grid": {"num_levels": 2, "log2_hashmap_size": 10, "max_res": 32, "target_samples": 1024},
+    "grid": {"num_levels": 2, "log2_hashmap_size": 10, "max_res": 32, "target_samples": 1024, "backend": "torch"},
     "downscale": 1.0,
 }
 FAST, INEXACT, NOTHING = MediumPrecision(2.53, 1.2e-5), MediumPrecision(4.0, 3e-4), MediumPrecision(1.0, 2e-7)
@@ -61,10 +62,19 @@ def test_a_run_in_seconds_takes_what_pays(
     medium: MediumPrecision, chosen: str, notes: list[str], here, progress
 ) -> None:
     widths = here(medium)
-    assert chosen_precision(Config(seconds=5, field="grid"), progress) == chosen
+    by_torch = HashGridOptions(backend="torch")
+    assert chosen_precision(Config(seconds=5, field="grid", grid=by_torch), progress) == chosen
     assert chosen_precision(Config(seconds=5, vanilla=VanillaOptions(width=48)), progress) == chosen
     assert progress.codes == 2 * notes and widths == [64, 48]
     assert progress.names(SAID, "2.5 times faster", "1e-05") == bool(notes)
+
+
+@pytest.mark.parametrize("device, asked", [("cpu", []), ("cuda", [64])])
+def test_warp_multiplies_by_itself_on_a_cpu(device: str, asked: list[int], here, progress, monkeypatch) -> None:
+    widths, config = here(FAST), Config(seconds=5, field="grid", grid=HashGridOptions(backend="warp"))
+    monkeypatch.setattr("stages.train.fields.hash_grid.compute_device", lambda: device)
+    assert chosen_precision(config, progress) == ("medium" if asked else "highest")
+    assert widths == asked
 
 
 def test_a_run_in_steps_depends_on_no_measurement(here, progress) -> None:

@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 import torch
 
-from nerf.kernels import Layers, grid_layout, warp
+from nerf.kernels import Layers, MlpGradients, Samples, grid_layout, warp
 from nerf.kernels.torch.adam import BETA1, BETA2
-from nerf.kernels.torch.mlp import BLOCK, backward_in_blocks, forward_in_blocks
+from nerf.kernels.torch.mlp import backward_in_blocks, forward_in_blocks
 from nerf.kernels.warp import encoding, gather, mlp
 from nerf.kernels.warp.adam import _adam4
 from nerf.kernels.warp.launch import launch
@@ -39,19 +39,39 @@ def test_gradients_of_the_table() -> None:
 
 
 @pytest.mark.parametrize("block", [1 << 22, 16])
-def test_networks(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(BLOCK, "cpu", block)
+def test_networks(block: int) -> None:
     samples, of_ray = packed("cpu", COUNTS), normal("cpu", 3, len(COUNTS), 64)
     layers = Layers(normal("cpu", 4, 20, 64), normal("cpu", 5, 3, 64))
     inputs, grad = normal("cpu", 6, len(samples.t), 20), normal("cpu", 7, len(samples.t), 3)
     forward, backward = mlp._hidden_layer_gpu, mlp._hidden_layer_backward_gpu
-    for ray, given in ((samples, of_ray), (None, None)):
-        found = forward_in_blocks(forward, layers, inputs, ray and ray.ray, given)
-        torch.testing.assert_close(found, warp.mlp_forward(layers, inputs, ray and ray.ray, given))
-        gradients = backward_in_blocks(forward, backward, layers, inputs, grad, ray, given)
-        torch.testing.assert_close(gradients, warp.mlp_backward(layers, inputs, grad, ray, given), rtol=1e-4, atol=1e-4)
+    for rays, given in ((samples, of_ray), (None, None)):
+        found = forward_in_blocks(forward, layers, inputs, rays and rays.ray, given, block)
+        torch.testing.assert_close(found, warp.mlp_forward(layers, inputs, rays and rays.ray, given))
+        gradients = backward_in_blocks(forward, backward, layers, inputs, grad, rays, given, block)
+        wanted = warp.mlp_backward(layers, inputs, grad, rays, given)
+        torch.testing.assert_close(gradients, wanted, rtol=1e-4, atol=1e-4)
     inputs[5, 7] = torch.nan
     assert forward(layers, inputs, samples.ray, of_ray)[5].isnan().all()
+
+
+@pytest.mark.parametrize("on_gpu", [False, True])
+def test_padding_behind_the_samples_changes_no_gradient(on_gpu: bool) -> None:
+    """As a CUDA graph has it: zeros that belong to no ray and have no gradient."""
+    samples, of_ray = packed("cpu", COUNTS), normal("cpu", 3, len(COUNTS), 64)
+    layers, count = Layers(normal("cpu", 4, 20, 64), normal("cpu", 5, 3, 64)), len(samples.t)
+    padded = Samples(samples.starts, *(torch.nn.functional.pad(each, (0, 50)) for each in samples[1:]))
+    inputs, grad = (torch.nn.functional.pad(normal("cpu", 6, count, size), (0, 0, 0, 50)) for size in (20, 3))
+
+    def gradients(samples: Samples, count: int) -> MlpGradients:
+        given = layers, inputs[:count], grad[:count], samples, of_ray
+        if on_gpu:
+            return backward_in_blocks(mlp._hidden_layer_gpu, mlp._hidden_layer_backward_gpu, *given, 1 << 22)
+        return warp.mlp_backward(*given)
+
+    found, wanted = gradients(padded, count + 50), gradients(samples, count)
+    assert torch.equal(found.inputs[:count], wanted.inputs) and not found.inputs[count:].any()
+    torch.testing.assert_close(found[:2], wanted[:2])
+    torch.testing.assert_close(found.ray_hidden, wanted.ray_hidden)
 
 
 def test_adam() -> None:
