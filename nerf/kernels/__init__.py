@@ -108,6 +108,10 @@ class RayStepping(NamedTuple):
         """The distance from which steps grow."""
         return self.step_size / self.cone_angle if self.cone_angle else math.inf
 
+    def longer(self, factor: float) -> "RayStepping":
+        """Every step so many times as long."""
+        return self._replace(step_size=factor * self.step_size, cone_angle=factor * self.cone_angle)
+
 
 class BinaryOccupancy(NamedTuple):
     """Which cells of the occupancy grid are occupied, a bit each, and how far each brick is from the nearest occupied

@@ -41,6 +41,8 @@ MIN_SAMPLES_PER_RAY = 2.0
 TOUCHED_FRACTION = 0.33
 # Of an entry: its gradient read; if there is one, that cleared, the entry itself and its moments read and written.
 ADAM_BYTES = 4 * (1 + 7 * TOUCHED_FRACTION)
+# Steps along rays while they are long (docs/experiments/ray_samples.md), beside those of the field.
+LONG_STEPS = 2.0
 SAMPLES_PER_RAY_EMA_DECAY = 0.9  # how much of the mean of samples per ray remains after each step
 
 
@@ -54,7 +56,9 @@ class HashGridTrainerSettings:
     where it shows the field which space is empty). ``distortion_weight``: full weight of the distortion loss, for
     scenes without a known background. ``depth_weight``: initial weight of the depth loss, at sparse points and where
     depth maps know the distance. ``min_photos``: how many photos must see a cell of unbounded space before their
-    foregrounds for it to hold density (nerf/training/frustum_mask.py), or all but one where they are few.
+    foregrounds for it to hold density (nerf/training/frustum_mask.py), or all but one where they are few. Up to a
+    progress of ``long_steps_until`` steps along rays are LONG_STEPS times as long, so that more rays are drawn while
+    surfaces are still thick; a CUDA graph holds one length for all steps.
     """
 
     seed: int
@@ -65,6 +69,7 @@ class HashGridTrainerSettings:
     distortion_weight: float = 0.0
     depth_weight: float = 0.0
     min_photos: int = 1
+    long_steps_until: float = 0.0
 
 
 class HashGridBatch(NamedTuple):
@@ -162,7 +167,7 @@ class HashGridTrainer:
         settings: HashGridTrainerSettings,
         effects: ImageEffects = NO_EFFECTS,
     ) -> None:
-        self.model, self.settings, self.effects = model, settings, effects
+        self.model, self.settings, self.effects, self.stepping = model, settings, effects, model.stepping
         # Nothing beyond the box of a bounded scene is rendered: a point there would pull density to its walls.
         self.dataset = dataset if model.space.unbounded else dataset.with_sparse_depths_within(model.space.half)
         self.occupancy_grid = OccupancyGrid(model, self._frustum_mask())
@@ -192,6 +197,8 @@ class HashGridTrainer:
 
     def take_step(self, step: int, progress: float, lr_scale: float) -> tuple[StepResult, Sequence[MicroBatch]]:
         """:meth:`step`, and what its micro-batches were."""
+        are_long = progress < self.settings.long_steps_until
+        self.model.stepping = self.stepping.longer(LONG_STEPS) if are_long else self.stepping
         device, count, rays = self.dataset.device, self.settings.micro_batches, self.rays_per_micro_batch()
         compute = partial(self._compute_micro_batch, step, progress, rays)
         if self.exchange is None:

@@ -15,6 +15,7 @@ from nerf.geometry.space_maps.contraction import Contraction
 from nerf.kernels import torch as reference
 from nerf.training.evaluation_pixels import evaluate, sample_evaluation_pixels
 from nerf.training.hash_grid_trainer import (
+    LONG_STEPS,
     HashGridBatch,
     HashGridTrainer,
     HashGridTrainerSettings,
@@ -78,6 +79,16 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit() -> None:
     assert [second.step(step, step / 40) for step in range(20, 40)] == results[20:]
     assert same(whole.state(), second.state())
     assert len({result.rays for result in results}) > 5, "the number of rays is meant to adapt"
+
+
+def test_steps_along_rays_are_long_at_first() -> None:
+    run = trainer(replace(TRAINER, long_steps_until=0.5))
+    own = run.model.stepping
+    short, long = (run.step(step, progress) for step, progress in enumerate((0.5, 0.49)))
+    assert run.model.stepping == own.longer(LONG_STEPS) and run.model.stepping.linear_until == own.linear_until
+    assert long.density_evaluations / long.rays < 0.7 * short.density_evaluations / short.rays
+    run.step(2, 0.5)
+    assert run.model.stepping == own
 
 
 def test_results_do_not_depend_on_the_number_of_threads() -> None:
