@@ -38,6 +38,7 @@ from stages.train.fields.hash_grid import (
     DISTORTION,
     EVEN_UNTIL,
     LEARNING_RATES,
+    LONG_STEPS_UNTIL,
     MAX_STEPS,
     MIN_PHOTOS,
     NDC_STEPS_PER_CELL,
@@ -112,6 +113,7 @@ def train(run: dict[str, Any], model: HashGridField, data: tuple[RayDataset, Ray
             distortion_weight=run["distortion"] or 0.0,
             depth_weight=DEPTH_LOSS,
             min_photos=MIN_PHOTOS,
+            long_steps_until=LONG_STEPS_UNTIL[SPACES[run["map"]]] if given.device == "cpu" else 0.0,
         ),
     )
     marks = {round(share * given.steps) for share in RECORDED}

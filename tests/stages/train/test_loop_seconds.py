@@ -13,41 +13,57 @@ from stages.train.checkpoints import latest_checkpoint
 from stages.train.loop import TrainingRun
 from stages.train.state import TrainingBudget, TrainingSpeed, checkpoint_interval
 from tests.refusals import no_note
-from tests.stages.train.one_number import Killed, OneNumber, killed_at, number_of, run_in, slow
+from tests.stages.train.one_number import Killed, OneNumber, number_of, run_in
 
 
-def test_a_run_in_seconds_ends_at_full_progress(tmp_path: Path, progress) -> None:
-    run = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
+Make = Callable[[int], OneNumber]
+
+
+def on_a_made_up_clock(monkeypatch: pytest.MonkeyPatch, takes: float, killed_at: int | None = None) -> Make:
+    """So many seconds a step, and no time at all beside the steps."""
+    now = 0.0
+
+    def step_by_step(step: int, lr_scale: float) -> None:
+        nonlocal now
+        if step == killed_at:
+            raise Killed
+        now += takes
+
+    monkeypatch.setattr(loop, "time", SimpleNamespace(perf_counter=lambda: now, monotonic=lambda: now))
+    return lambda attempt: OneNumber(attempt, step_by_step)
+
+
+def test_a_run_in_seconds_ends_at_full_progress(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = run_in(tmp_path, progress, TrainingBudget(None, 30.0), on_a_made_up_clock(monkeypatch, 0.3))
     run.train()
-    assert 0.2 < run.state.seconds < 0.5
+    assert run.state.seconds == pytest.approx(30, abs=0.5)
     assert run.schedule.progress(run.state.step) == pytest.approx(1)
     assert len(run.schedule.revisions) >= 2
     shares = [share for _, share, _ in number_of(run).history]
     assert 0.8 < shares[-1] < 1
 
 
-def test_a_resumed_run_in_seconds_keeps_its_clock(tmp_path: Path, progress) -> None:
+def test_a_resumed_run_in_seconds_keeps_its_clock(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
+    budget = TrainingBudget(None, 30.0)
     with pytest.raises(Killed):
-        run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=killed_at(30)).train()
+        run_in(tmp_path, progress, budget, on_a_made_up_clock(monkeypatch, 0.3, killed_at=30)).train()
     journal = json.loads((tmp_path / "schedule.json").read_text())
-    resumed = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
+    resumed = run_in(tmp_path, progress, budget, on_a_made_up_clock(monkeypatch, 0.3))
     resumed.train()
     assert [list(decision) for decision in resumed.schedule.revisions][: len(journal)] == journal
     assert number_of(resumed).history[0][:2] == (30, resumed.schedule.progress(30))
-    assert 0.2 < resumed.state.seconds < 0.5
-    assert progress.names("train.resumes", "step 30", "0 s")
+    assert resumed.state.seconds == pytest.approx(30, abs=0.5)
+    assert progress.names("train.resumes", "step 30", "21 s")
 
 
-def test_more_seconds_take_about_that_long(tmp_path: Path, progress) -> None:
-    def make(attempt: int) -> OneNumber:
-        return OneNumber(attempt, slow)
-
-    first = run_in(tmp_path / "first", progress, TrainingBudget(None, 0.2), make)
+def test_more_seconds_take_that_long(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
+    make = on_a_made_up_clock(monkeypatch, 0.3)
+    first = run_in(tmp_path / "first", progress, TrainingBudget(None, 30.0), make)
     first.train()
-    more = run_in(tmp_path / "more", progress, TrainingBudget(None, 0.2, tmp_path / "first"), make)
+    more = run_in(tmp_path / "more", progress, TrainingBudget(None, 30.0, tmp_path / "first"), make)
     assert more.schedule.progress(first.state.step) == pytest.approx(0.5, abs=0.05)
     more.train()
-    assert 0.1 < more.state.seconds - first.state.seconds < 0.35
+    assert more.state.seconds - first.state.seconds == pytest.approx(30, abs=0.5)
 
 
 def run_on_a_made_up_clock(
