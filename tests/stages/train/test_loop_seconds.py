@@ -15,7 +15,6 @@ from stages.train.state import TrainingBudget, TrainingSpeed, checkpoint_interva
 from tests.refusals import no_note
 from tests.stages.train.one_number import Killed, OneNumber, number_of, run_in
 
-
 Make = Callable[[int], OneNumber]
 
 
