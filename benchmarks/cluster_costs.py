@@ -123,7 +123,7 @@ def parts(ingest: Path, photos: list[Photo], core: int) -> dict[str, float]:
                 took[f"{name} bytes"] = len(pickle.dumps(features.read(db, 0)(), 5))
         shutil.copyfile(database, indexed := Path(scratch, "c.db"))
         for name, file, features in (("match", database, None), ("match indexed", indexed, Features(words))):
-            took[name] = seconds(
+            took[name] = core_seconds(
                 lambda of=features, to=file: match_pairs(to, pairs, 0, STRICT_RATIO, features=of)
             ) / len(pairs)
         took["write pair"] = core_seconds(lambda: copy_matches(database, copy)) / len(pairs)

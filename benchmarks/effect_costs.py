@@ -28,7 +28,7 @@ from stages.train import Config
 from stages.train.fields.field_list import make_trainer
 
 WARM_STEPS = 300
-SHARE = 0.1  # of the run: the learning rate is still whole
+PROGRESS = 0.5  # the learning rate is still whole, steps along rays are short
 
 
 class Timed:
@@ -93,12 +93,12 @@ def main() -> None:
     with use_matmul_precision(config.matmul):
         for each in trainers.values():
             for step in range(WARM_STEPS):
-                each.step(step, SHARE, 1.0)
+                each.step(step, PROGRESS, 1.0)
         identity.seconds.clear()
         for step in range(WARM_STEPS, WARM_STEPS + given.rounds):
             for name, each in trainers.items():
                 began = time.perf_counter()
-                each.step(step, SHARE, 1.0)
+                each.step(step, PROGRESS, 1.0)
                 seconds[name].append(time.perf_counter() - began)
     off = seconds.pop("off")
     share = sum(identity.seconds) / sum(off)

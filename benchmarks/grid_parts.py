@@ -35,7 +35,7 @@ from stages.train.profile import FIRST_PROFILED_STEP, RATES_SECONDS, profile_tab
 
 LINKED = {"ingest": "photos.json", "normalise": "scene.json", "effects": "effects.json"}
 WARM_STEPS, TIMED_STEPS = 300, 60
-SHARE = 0.1  # of the run: the learning rate is still whole
+PROGRESS = 0.5  # the learning rate is still whole, steps along rays are short
 
 
 def main() -> None:
@@ -56,9 +56,9 @@ def main() -> None:
     device = torch.device(compute_device())
     with use_matmul_precision(config.matmul):
         for step in range(WARM_STEPS):
-            trainer.step(step, SHARE, 1.0)
+            trainer.step(step, PROGRESS, 1.0)
         for step in range(WARM_STEPS, WARM_STEPS + TIMED_STEPS):
-            profiled_step(partial(trainer.step, step, SHARE, 1.0), FIRST_PROFILED_STEP, timings, device)
+            profiled_step(partial(trainer.step, step, PROGRESS, 1.0), FIRST_PROFILED_STEP, timings, device)
         field = field_of(config)
         rates = measure_rates(device, field.matmul_width(config), field.table_rows(config), RATES_SECONDS)
         table = profile_table(timings, rates)

@@ -120,7 +120,7 @@ def our_result(workspace: Workspace, source: Source) -> Result:
     seconds = {stage: round(manifest["seconds"], 1) for stage, manifest in manifests.items()}
     shown = moved(read_obj(folder / "mesh.obj"), source.scene.scene_from_sfm)
     train = len(source.scene.of_split("train"))
-    facts = {"seconds": round(sum(seconds.values())), "photos": train, "test_photos": 0, "off_px": None}
+    facts = {"seconds": round(sum(seconds.values())), "photos": train, "test_photos": None, "off_px": None}
     return Result("ours", shown, True, facts)
 
 

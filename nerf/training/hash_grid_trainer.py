@@ -41,8 +41,8 @@ MIN_SAMPLES_PER_RAY = 2.0
 TOUCHED_FRACTION = 0.33
 # Of an entry: its gradient read; if there is one, that cleared, the entry itself and its moments read and written.
 ADAM_BYTES = 4 * (1 + 7 * TOUCHED_FRACTION)
-# Steps along rays while they are long (docs/experiments/ray_samples.md), beside those of the field.
-LONG_STEPS = 2.0
+# How many times as long as the field's own steps along rays are while they are long (docs/experiments/ray_samples.md).
+LONG_STEP_FACTOR = 2.0
 SAMPLES_PER_RAY_EMA_DECAY = 0.9  # how much of the mean of samples per ray remains after each step
 
 
@@ -57,8 +57,8 @@ class HashGridTrainerSettings:
     scenes without a known background. ``depth_weight``: initial weight of the depth loss, at sparse points and where
     depth maps know the distance. ``min_photos``: how many photos must see a cell of unbounded space before their
     foregrounds for it to hold density (nerf/training/frustum_mask.py), or all but one where they are few. Up to a
-    progress of ``long_steps_until`` steps along rays are LONG_STEPS times as long, so that more rays are drawn while
-    surfaces are still thick; a CUDA graph holds one length for all steps.
+    progress of ``long_steps_until``, steps along rays are LONG_STEP_FACTOR times as long, so that a ray has fewer
+    samples while surfaces are still thick; a CUDA graph holds one length for all steps.
     """
 
     seed: int
@@ -198,7 +198,7 @@ class HashGridTrainer:
     def take_step(self, step: int, progress: float, lr_scale: float) -> tuple[StepResult, Sequence[MicroBatch]]:
         """:meth:`step`, and what its micro-batches were."""
         are_long = progress < self.settings.long_steps_until
-        self.model.stepping = self.stepping.longer(LONG_STEPS) if are_long else self.stepping
+        self.model.stepping = self.stepping.longer(LONG_STEP_FACTOR) if are_long else self.stepping
         device, count, rays = self.dataset.device, self.settings.micro_batches, self.rays_per_micro_batch()
         compute = partial(self._compute_micro_batch, step, progress, rays)
         if self.exchange is None:
@@ -222,12 +222,18 @@ class HashGridTrainer:
 
     def count_samples(self, colours: int, rays: int) -> None:
         """Of a step: the next ones draw rays accordingly."""
-        self.samples_per_ray.mul_(SAMPLES_PER_RAY_EMA_DECAY).add_((1 - SAMPLES_PER_RAY_EMA_DECAY) * colours / rays)
+        per_ray = self._long_factor() * colours / rays
+        self.samples_per_ray.mul_(SAMPLES_PER_RAY_EMA_DECAY).add_((1 - SAMPLES_PER_RAY_EMA_DECAY) * per_ray)
+
+    def _long_factor(self) -> float:
+        """How many times as long as the field's own the steps along rays are now: 1 / that many samples has a ray, of
+        those that it is counted with, so that the change to short steps finds the right number of rays."""
+        return self.model.stepping.step_size / self.stepping.step_size
 
     def state(self) -> dict[str, Tensor]:
         """Weights and occupancy bits as ``model.<name>``, per-image parameters as ``image.<effect>.<name>``, Adam's
         moments as ``exp_avg.<name>`` and ``exp_avg_sq.<name>``, the optical thickness of the occupancy grid's cells,
-        the mean number of samples per ray, how many pixels were sampled, and the field's settings, to know it by."""
+        the mean number of samples per ray (at steps of the field's own length), how many pixels were sampled, and the field's settings, to know it by."""
         return (
             {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
             | {f"image.{name}": tensor for name, tensor in self.effects.parameters.items()}
@@ -252,7 +258,8 @@ class HashGridTrainer:
 
     def rays_per_micro_batch(self) -> int:
         """As many as have the colours that a step should compute, by the last steps."""
-        rays = int(self.settings.target_samples / max(MIN_SAMPLES_PER_RAY, float(self.samples_per_ray)))
+        per_ray = float(self.samples_per_ray) / self._long_factor()
+        rays = int(self.settings.target_samples / max(MIN_SAMPLES_PER_RAY, per_ray))
         return max(1, rays // self.settings.micro_batches)
 
     def draw_batch(self, step: int, progress: float, index: int, count: int) -> HashGridBatch:

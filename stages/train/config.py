@@ -87,7 +87,7 @@ class Config(StageConfig):
         default=None,
         description=(
             "Precision of torch's matrix multiplications (default: highest; medium for a run in seconds if it is "
-            "measured to be faster and about as exact)."
+            "measured to be faster and about as exact). Warp's kernels on a CPU do without it."
         ),
     )
     # `--more` gives these.

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 MAX_PIXELS = 400e6  # of many photos, which are held in memory: 1.2 GB
 MAX_PHOTOS = 48  # of 240 photos of one scene, 0.2 rays a pixel are best (docs/experiments/many_photos.md)
 TIMED_SECONDS = 1.0
+TIMED_PROGRESS = 0.5  # most of a run is past its long steps along rays
 MAX_MEMORY_SHARE = 0.5  # of what is free on a GPU: what the pixels may take of it
 MIN_NAMED_GAIN = 0.2  # of the photos' width: what larger photos have to have before they are worth a word
 
@@ -104,11 +105,11 @@ def seconds_per_step(config: Config, scene: "Scene", decisions: Decisions, devic
     effects = image_effects(decisions, scene, scene.of_split("train")[:1], dataset)
     trainer = make_trainer(config, scene, dataset, seed=0, effects=effects)
     with use_matmul_precision(config.matmul):
-        trainer.step(0, 0.0, 1.0)  # the first step pays for memory and kernels
+        trainer.step(0, TIMED_PROGRESS, 1.0)  # the first step pays for memory and kernels
         started, steps = time.perf_counter(), 0
         while steps == 0 or time.perf_counter() - started < TIMED_SECONDS:
             steps += 1
-            trainer.step(steps, 0.0, 1.0)
+            trainer.step(steps, TIMED_PROGRESS, 1.0)
         return (time.perf_counter() - started) / steps
 
 

@@ -31,9 +31,11 @@ def mlp_forward(
     ray_hidden: Float[Tensor, "rays hidden"] | None = None,
 ) -> Float[Tensor, "samples outputs"]:
     """As in nerf.kernels.torch.mlp."""
+    assert (ray is None) == (ray_hidden is None), "rays are given or not"
     if inputs.is_cuda:
         return forward_in_blocks(_hidden_layer_gpu, layers, inputs, ray, ray_hidden, BLOCK["cuda"])
     count, width = inputs.shape
+    assert width == len(layers.hidden), "every input has its weights"
     outputs, rays = inputs.new_empty(count, len(layers.out)), _rays_or_empty(inputs, ray, ray_hidden)
     arguments = width, layers.hidden, *rays, _padded_columns(layers.out), len(layers.out)
     launch(_mlp_forward, -(-count // TILE), inputs, *arguments, outputs)
@@ -53,6 +55,7 @@ def mlp_backward(
         return backward_in_blocks(_hidden_layer_gpu, _hidden_layer_backward_gpu, *given)
     assert (samples is None) == (ray_hidden is None), "rays are given or not"
     count, width = inputs.shape
+    assert width == len(layers.hidden) and grad.shape == (count, len(layers.out)), "every number has its weights"
     rays = _rays_or_empty(inputs, None if samples is None else samples.ray, ray_hidden)
     of_layers, of_inputs = (torch.zeros_like(layers.hidden), torch.zeros_like(layers.out)), torch.empty_like(inputs)
     of_rays = torch.zeros_like(rays[1])

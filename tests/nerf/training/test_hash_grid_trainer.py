@@ -12,10 +12,11 @@ from nerf.fields.background import background_colour
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.rays import Rays
 from nerf.geometry.space_maps.contraction import Contraction
+from nerf.kernels import RayStepping
 from nerf.kernels import torch as reference
 from nerf.training.evaluation_pixels import evaluate, sample_evaluation_pixels
 from nerf.training.hash_grid_trainer import (
-    LONG_STEPS,
+    LONG_STEP_FACTOR,
     HashGridBatch,
     HashGridTrainer,
     HashGridTrainerSettings,
@@ -69,12 +70,14 @@ def test_it_trains_behind_the_common_interface() -> None:
     assert before < probe.mean_colour_psnr < probe.mean_colour_psnr + 5 < after < 60
 
 
-def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit() -> None:
-    whole, first = trainer(), trainer()
+@pytest.mark.parametrize("long_steps_until", [0.0, 0.5, 0.6])
+def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit(long_steps_until: float) -> None:
+    settings = replace(TRAINER, long_steps_until=long_steps_until)
+    whole, first = trainer(settings), trainer(settings)
     results = [whole.step(step, step / 40) for step in range(40)]
     for step in range(20):
         first.step(step, step / 40)
-    second = trainer()
+    second = trainer(settings)
     second.load_state(copied(first.state()))
     assert [second.step(step, step / 40) for step in range(20, 40)] == results[20:]
     assert same(whole.state(), second.state())
@@ -85,10 +88,17 @@ def test_steps_along_rays_are_long_at_first() -> None:
     run = trainer(replace(TRAINER, long_steps_until=0.5))
     own = run.model.stepping
     short, long = (run.step(step, progress) for step, progress in enumerate((0.5, 0.49)))
-    assert run.model.stepping == own.longer(LONG_STEPS) and run.model.stepping.linear_until == own.linear_until
+    assert run.model.stepping == own.longer(LONG_STEP_FACTOR)
     assert long.density_evaluations / long.rays < 0.7 * short.density_evaluations / short.rays
+    assert long.rays > 1.5 * short.rays, "as many colours, at once"
     run.step(2, 0.5)
     assert run.model.stepping == own
+
+
+def test_longer_steps_grow_from_the_same_distance_on() -> None:
+    stepping = RayStepping(0.01, 0.02, True, 32, 1024)
+    assert stepping.longer(2) == RayStepping(0.02, 0.04, True, 32, 1024)
+    assert stepping.longer(2).linear_until == stepping.linear_until
 
 
 def test_results_do_not_depend_on_the_number_of_threads() -> None:

@@ -23,6 +23,12 @@ from nerf.kernels.warp.launch import launch
 from nerf.kernels.warp.mlp import _relu_backward_gpu
 launch(_relu_backward_gpu, 32, torch.ones(2, 64), torch.ones(1, 64))
 """
+NO_SUCH_RAY = """
+import torch
+from nerf.kernels import Layers, warp
+layers = Layers(torch.ones(4, 64), torch.ones(3, 64))
+warp.mlp_forward(layers, torch.ones(5, 4), torch.tensor([0, 1, 2, 1, 0], dtype=torch.int32), torch.ones(2, 64))
+"""
 
 
 @pytest.mark.slow
@@ -36,6 +42,8 @@ def test_no_kernel_reads_or_writes_beyond_its_arrays(tmp_path: Path) -> None:
 
     beyond = in_debug_mode(BEYOND)
     assert beyond.returncode != 0 and "Assertion failed: 'i >= -arr.shape[0] && i < arr.shape[0]'" in beyond.stderr
+    no_such_ray = in_debug_mode(NO_SUCH_RAY)
+    assert no_such_ray.returncode != 0 and "Assertion failed: 'rays.data[first + s] >= 0" in no_such_ray.stderr
     everything = in_debug_mode(TESTED)
     assert everything.returncode == 0, everything.stdout[-3000:] + everything.stderr[-3000:]
     assert " passed" in everything.stdout
