@@ -233,7 +233,8 @@ class HashGridTrainer:
     def state(self) -> dict[str, Tensor]:
         """Weights and occupancy bits as ``model.<name>``, per-image parameters as ``image.<effect>.<name>``, Adam's
         moments as ``exp_avg.<name>`` and ``exp_avg_sq.<name>``, the optical thickness of the occupancy grid's cells,
-        the mean number of samples per ray (at steps of the field's own length), how many pixels were sampled, and the field's settings, to know it by."""
+        the mean number of samples per ray (at steps of the field's own length), how many pixels were sampled, and the
+        field's settings, to know it by."""
         return (
             {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
             | {f"image.{name}": tensor for name, tensor in self.effects.parameters.items()}

@@ -55,8 +55,8 @@ NDC_STEPS_PER_CELL = 1 / 4
 # Contracted space: steps in one of the finest cells, by how many of these along an axis it counts for at most. Finer
 # cells gain more by more rays than by closer samples (docs/experiments/cell_sizes.md).
 STEPS_PER_CELL = {512: 3, 2048: 1.5}
-# Progress up to which steps along rays are long, on a CPU (docs/experiments/ray_samples.md). A GPU has one CUDA graph for
-# all of its steps; a finished training that goes on has thin surfaces already.
+# Progress up to which steps along rays are long, on a CPU (docs/experiments/ray_samples.md). A GPU has one CUDA graph
+# for all of its steps; a finished training that goes on has thin surfaces already.
 LONG_STEPS_UNTIL = {"bounded": 0.0, "contracted": 0.0, "ndc": 1 / 3}
 EVEN_UNTIL = 0.25  # contracted space: scene units from the camera up to which steps are even; beyond, they grow
 # Contracted space: at the shortest steps so many samples reach to a distance of 23; --train.grid.ray-samples may ask
