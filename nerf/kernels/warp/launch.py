@@ -94,9 +94,8 @@ def launch(kernel: wp.Kernel, count: int, *arguments: Argument) -> None:
             if rest:
                 raise TypeError(_unreadable(kernel, place, array, device, argument))
             if entries > MAX_ENTRIES:
-                raise TypeError(
-                    f"{kernel.key}: {kernel.adj.args[place - 1].label} has {entries:,} entries; Warp counts to {MAX_ENTRIES:,}"
-                )
+                name = kernel.adj.args[place - 1].label
+                raise TypeError(f"{kernel.key}: {name} has {entries:,} entries; Warp counts to {MAX_ENTRIES:,}")
             entry = ready.params[place]
             entry.data, entry.shape[0] = argument.data_ptr(), entries
         elif array is None:
