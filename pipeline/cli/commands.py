@@ -27,7 +27,7 @@ from pipeline.cli.options import (
     with_lasting_cameras,
     with_source,
 )
-from pipeline.cli.signals import Terminated, go_on, heed_signals
+from pipeline.cli.signals import Terminated, end_soon, go_on, heed_signals
 from pipeline.cli.terminal import Unread, choose_display, open_closed_streams
 from pipeline.engine import machine, stage_list, status
 from pipeline.engine.display import Display, SilentDisplay
@@ -57,6 +57,8 @@ def main() -> None:
             code = run_command(sys.argv[1:])
         except SystemExit as ending:  # of a help text
             code = ending.code
+        if code in (exit_codes.INTERRUPT, exit_codes.TERMINATED):
+            end_soon(code)
         sys.stdout.flush()
     except BrokenPipeError:
         Unread(sys.stdout).leave()

@@ -1,6 +1,7 @@
 """How a command is stopped from outside: Ctrl-C raises KeyboardInterrupt, SIGTERM :class:`Terminated`, and neither gets
 lost; a terminal that is closed stops nothing."""
 
+import os
 import signal
 import sys
 import threading
@@ -11,6 +12,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
 LATER = 0.05  # seconds
+MAX_ENDING_SECONDS = 5.0  # from when it is said that the command was stopped
 
 
 class Terminated(BaseException):
@@ -23,6 +25,15 @@ def heed_signals() -> None:
     if hasattr(signal, "SIGHUP"):  # a run outlives its terminal, and so does what it starts
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
     sys.unraisablehook = _send_again
+
+
+def end_soon(code: int) -> None:
+    """The program ends with this exit code within MAX_ENDING_SECONDS, whatever its threads do. Python waits for them at
+    its end, and a signal that falls between the start of a pool's thread and the pool's note of it leaves one that
+    nothing tells to end."""
+    ending = threading.Timer(MAX_ENDING_SECONDS, os._exit, (code,))
+    ending.daemon = True
+    ending.start()
 
 
 def go_on(words: Sequence[str]) -> str:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.cli.commands import run_command
+from pipeline.cli import commands
 from pipeline.engine import manifests
 
 MARK = "PIPELINE_DRILL"  # in the environment of a program and of all that it starts
@@ -128,7 +128,8 @@ def _live(words: list[str], files: Path, mark: str, prepare: Prepare) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if prepare is not None:
         prepare()
-    sys.exit(run_command(words))
+    sys.argv[1:] = words
+    commands.main()
 
 
 def run_words(photos: Path, workspace: Path, *more: str) -> list[str]:

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 from functools import partial
 from pathlib import Path
 
@@ -37,6 +38,17 @@ def test_two_of_them_are_not_worse_than_one(chain: Chain, tmp_path: Path):
     program.wait_until(lambda events: any("step" in event.get("message", "") for event in events))
     for _ in range(3):
         os.killpg(program.process.pid, signal.SIGINT)
+    assert program.strike(signal.SIGINT) < PATIENT
+    assert unclean(program, signal.SIGINT, tmp_path / "w.nerf") == []
+
+
+def leave_a_thread_behind() -> None:
+    threading.Thread(target=threading.Event().wait).start()
+
+
+def test_a_thread_that_never_ends_does_not_keep_it(chain: Chain, tmp_path: Path):
+    program = chain.start(chain.before("train", tmp_path / "w.nerf"), prepare=leave_a_thread_behind)
+    program.wait_until(lambda events: any("step" in event.get("message", "") for event in events))
     assert program.strike(signal.SIGINT) < PATIENT
     assert unclean(program, signal.SIGINT, tmp_path / "w.nerf") == []
 
