@@ -27,11 +27,11 @@ def heed_signals() -> None:
     sys.unraisablehook = _send_again
 
 
-def end_soon(code: int) -> None:
+def end_soon(exit_code: int) -> None:
     """The program ends with this exit code within MAX_ENDING_SECONDS, whatever its threads do. Python waits for them at
     its end, and a signal that falls between the start of a pool's thread and the pool's note of it leaves one that
     nothing tells to end."""
-    ending = threading.Timer(MAX_ENDING_SECONDS, os._exit, (code,))
+    ending = threading.Timer(MAX_ENDING_SECONDS, os._exit, (exit_code,))
     ending.daemon = True
     ending.start()
 

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,13 +16,14 @@ from stages.effects.decisions import Decisions, Space
 from stages.train.config import Config
 from stages.train.data import camera_directions
 from stages.train.fields.field_list import make_trainer, with_defaults
+from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.fields.space import MAX_NEAR_RATIO, MAX_WIDTH, chosen_space, near_ratio, space_map_of, width_in_photos
 from tests.camera_layouts import ring, wall
 from tests.refusals import refused
 
 CAMERA = Camera("PINHOLE", 40, 30, (40.0, 40.0, 20.0, 15.0))
 UNBOUNDED = Decisions({"background": {}})
-SMALL = {
+SMALL: dict[str, dict[str, Any]] = {
     "grid": {"num_levels": 2, "log2_hashmap_size": 10, "max_res": 32, "target_samples": 512, "micro_batches": 1},
     "vanilla": {"depth": 2, "width": 8, "samples_coarse": 4, "samples_fine": 4, "batch_rays": 32},
 }
@@ -128,7 +130,9 @@ def grey_dataset(scene: Scene) -> RayDataset:
 def test_steps_are_long_at_first_in_ndc_on_a_cpu(
     space: Space, device: str, after: str | None, long_until: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = with_defaults(Config(field="grid", space=space, view_dependence=True, after=after, grid=SMALL["grid"]))
+    config = with_defaults(
+        Config(field="grid", space=space, view_dependence=True, after=after, grid=HashGridOptions(**SMALL["grid"]))
+    )
     monkeypatch.setattr("stages.train.fields.hash_grid.compute_device", lambda: device)
     scene = scene_of(wall())
     trainer = make_trainer(config.filled({"grid": {"backend": "torch"}}), scene, grey_dataset(scene), 0)
