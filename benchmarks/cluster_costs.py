@@ -289,10 +289,7 @@ def phases(workspace: Path) -> dict[str, Any]:
     edges = [began, *(times[name] for name in ("features", "matching", "mapping"))]
     edges.append(began + timedelta(seconds=manifest["seconds"]))
     took = [round((after - before).total_seconds(), 1) for before, after in pairwise(edges)]
-    facts, ingest = (
-        manifest["facts"],
-        Workspace(workspace).folder("ingest", Workspace(workspace).read_run().keys["ingest"]),
-    )
+    facts = manifest["facts"]
     names = ("features_seconds", "matching_seconds", "mapping_seconds", "finish_seconds")
     row = {"photos": facts["photos"], "pairs": facts["match_graph"]["tried"], **dict(zip(names, took, strict=True))}
     ingest_seconds = read_json(ingest / "manifest.json")["seconds"]

@@ -11,6 +11,7 @@ SSIM of the windows that hold nothing else; both are means over the photos. Pict
 
 import argparse
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -104,6 +105,22 @@ def scores(image: np.ndarray, truth: np.ndarray, used: np.ndarray) -> tuple[floa
     return -10 * math.log10(max(error, 1e-10)), similarity
 
 
+def truth_of(source: Source, photo: Photo) -> tuple[np.ndarray, np.ndarray]:
+    """A photo at the size at which it is scored, (h, w, 3) float32 sRGB in [0, 1], and where no mask excludes it,
+    (h, w) bool."""
+    width, height = scaled_size(photo.camera, None)
+    truth = load_pixels(source.ingest / photo.view.file, width, height)[..., :3] / np.float32(255)
+    mask = view_mask(source.ingest, source.scene, photo.view, None)
+    return truth, np.ones((height, width), bool) if mask is None else mask.numpy()
+
+
+def write_strip(pictures: Path, photo: Photo, images: Iterable[np.ndarray]) -> None:
+    """Pictures of a photo side by side, in a file that is called as the photo."""
+    pictures.mkdir(parents=True, exist_ok=True)
+    strip = np.rint(np.concatenate([*images], axis=1) * 255).astype(np.uint8)
+    write_png(pictures / f"{Path(photo.view.file).stem}.png", strip)
+
+
 def meshes_of(source: Source, inputs: Inputs, resolution: int) -> dict[str, tuple[ColouredMesh, bool]]:
     """The meshes compared, and whether to show their texture."""
     made = []
@@ -121,12 +138,10 @@ def figures(source: Source, inputs: Inputs, given: argparse.Namespace, pictures:
     shares = []
     for view in source.scene.of_split("test"):
         photo = photo_of(view, source.scene, source.ingest, source.info)
-        width, height = scaled_size(photo.camera, None)
-        truth = load_pixels(source.ingest / view.file, width, height)[..., :3] / np.float32(255)
+        truth, unmasked = truth_of(source, photo)
+        height, width = unmasked.shape
         drawn = {kind: looks(mesh, has_texture, photo, width, height) for kind, (mesh, has_texture) in kinds.items()}
-        used = np.logical_and.reduce([covered for _, covered in drawn.values()])
-        mask = view_mask(source.ingest, source.scene, view, None)
-        used &= True if mask is None else mask.numpy()
+        used = np.logical_and.reduce([covered for _, covered in drawn.values()]) & unmasked
         images = {kind: image for kind, (image, _) in drawn.items()}
         if given.field:
             images["field"] = field_render(source, inputs["train"], photo)
@@ -134,8 +149,7 @@ def figures(source: Source, inputs: Inputs, given: argparse.Namespace, pictures:
         for kind, image in images.items():
             found.setdefault(kind, []).append(scores(image, truth, used))
         if pictures:
-            strip = np.concatenate([truth, *images.values()], axis=1)
-            write_png(pictures / f"{Path(view.file).stem}.png", np.rint(strip * 255).astype(np.uint8))
+            write_strip(pictures, photo, [truth, *images.values()])
     row: dict[str, Any] = {
         "faces": len(kinds["texture"][0].faces),
         "untextured_faces": len(kinds["untextured"][0].faces),

@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
-from benchmarks.mesh_looks import looks, scores
+from benchmarks.mesh_looks import looks, scores, truth_of, write_strip
 from benchmarks.record import Record, add_out
 from nerf.geometry.alignment import MAX_DEVIATION, align
 from nerf.geometry.scene import Similarity
@@ -42,8 +42,8 @@ from nerf.rendering.srgb import linear_light, srgb_values
 from pipeline.engine.workspace import Workspace
 from stages import mesh
 from stages.contract import SilentProgress
-from stages.io.files import read_json, write_png
-from stages.io.pixels import load_pixels, pillow
+from stages.io.files import read_json
+from stages.io.pixels import pillow
 from stages.io.sparse_model import SparseModel
 from stages.mesh.extraction import Source, load
 from stages.mesh.files import ColouredMesh
@@ -51,7 +51,6 @@ from stages.mesh.surface import Surface, vertex_normals
 from stages.mesh.texture.atlas import Atlas, Texture
 from stages.mesh.texture.photos import Photo, photo_of, projected
 from stages.sfm.colmap.models import read_model
-from stages.train.data import scaled_size, view_mask
 
 MAX_PAIR_PX = 1.0  # between features of two programs that are taken for one
 ALIGNMENT_ROUNDS = 5
@@ -194,18 +193,13 @@ def photo_scores(
     results: list[Result], source: Source, photo: Photo, pictures: Path | None
 ) -> list[tuple[Score, Score]]:
     """Of each mesh in a test photo, on what it covers and on what all of them cover."""
-    view = photo.view
-    width, height = scaled_size(photo.camera, None)
-    truth = load_pixels(source.ingest / view.file, width, height)[..., :3] / np.float32(255)
+    truth, unmasked = truth_of(source, photo)
+    height, width = unmasked.shape
     as_it_is = photo._replace(effects=(), shown=())
     drawn = [looks(each.mesh, True, photo if each.is_ours else as_it_is, width, height) for each in results]
-    mask = view_mask(source.ingest, source.scene, view, None)
-    unmasked = np.ones((height, width), bool) if mask is None else mask.numpy()
     common = np.logical_and.reduce([covered for _, covered in drawn]) & unmasked
     if pictures:
-        pictures.mkdir(parents=True, exist_ok=True)
-        strip = np.concatenate([truth, *(image for image, _ in drawn)], axis=1)
-        write_png(pictures / f"{Path(view.file).stem}.png", np.rint(strip * 255).astype(np.uint8))
+        write_strip(pictures, photo, [truth, *(image for image, _ in drawn)])
     return [(scored(image, truth, covered & unmasked), scored(image, truth, common)) for image, covered in drawn]
 
 

@@ -226,8 +226,8 @@ class HashGridTrainer:
         self.samples_per_ray.mul_(SAMPLES_PER_RAY_EMA_DECAY).add_((1 - SAMPLES_PER_RAY_EMA_DECAY) * per_ray)
 
     def _long_factor(self) -> float:
-        """How many times as long as the field's own the steps along rays are now: 1 / that many samples has a ray, of
-        those that it is counted with, so that the change to short steps finds the right number of rays."""
+        """How many times as long as the field's own the steps along rays are now. Samples of a ray are counted as if it
+        were 1, so that the step at which it changes has the right number of rays."""
         return self.model.stepping.step_size / self.stepping.step_size
 
     def state(self) -> dict[str, Tensor]:

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from nerf.kernels import HIDDEN, Layers, MlpGradients, Samples
-from nerf.kernels.torch.mlp import BLOCK, backward_in_blocks, forward_in_blocks
+from nerf.kernels.torch.mlp import BLOCK, backward_in_blocks, forward_in_blocks, hidden_layer
 from nerf.kernels.warp.launch import launch
 
 wp.set_module_options({"enable_backward": False})
@@ -330,9 +330,9 @@ def _hidden_layer_gpu(
     ray: Int32[Tensor, "samples"] | None,
     ray_hidden: Float[Tensor, "rays hidden"] | None,
 ) -> Float[Tensor, "samples hidden"]:
-    hidden = inputs @ layers.hidden
     if ray is None or ray_hidden is None:
-        return hidden.relu_()
+        return hidden_layer(layers, inputs, None, None)
+    hidden = inputs @ layers.hidden
     launch(_add_ray_relu_gpu, _VEC4_PER_ROW * len(hidden), ray, ray_hidden, hidden)
     return hidden
 

@@ -18,22 +18,27 @@ from tests.stages.train.one_number import Killed, OneNumber, number_of, run_in
 Make = Callable[[int], OneNumber]
 
 
-def on_a_made_up_clock(monkeypatch: pytest.MonkeyPatch, takes: float, killed_at: int | None = None) -> Make:
-    """So many seconds a step, and no time at all beside the steps."""
+def on_a_made_up_clock(
+    monkeypatch: pytest.MonkeyPatch,
+    takes: Callable[[int], float],
+    killed_at: int | None = None,
+    killed_after: float = math.inf,
+) -> Make:
+    """``takes(step)`` seconds a step, and no time beside the steps. Killed at a step or after so many seconds."""
     now = 0.0
 
     def step_by_step(step: int, lr_scale: float) -> None:
         nonlocal now
-        if step == killed_at:
+        if step == killed_at or now >= killed_after:
             raise Killed
-        now += takes
+        now += takes(step)
 
     monkeypatch.setattr(loop, "time", SimpleNamespace(perf_counter=lambda: now, monotonic=lambda: now))
     return lambda attempt: OneNumber(attempt, step_by_step)
 
 
 def test_a_run_in_seconds_ends_at_full_progress(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = run_in(tmp_path, progress, TrainingBudget(None, 30.0), on_a_made_up_clock(monkeypatch, 0.3))
+    run = run_in(tmp_path, progress, TrainingBudget(None, 30.0), on_a_made_up_clock(monkeypatch, lambda _: 0.3))
     run.train()
     assert run.state.seconds == pytest.approx(30, abs=0.5)
     assert run.schedule.progress(run.state.step) == pytest.approx(1)
@@ -45,9 +50,9 @@ def test_a_run_in_seconds_ends_at_full_progress(tmp_path: Path, progress, monkey
 def test_a_resumed_run_in_seconds_keeps_its_clock(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
     budget = TrainingBudget(None, 30.0)
     with pytest.raises(Killed):
-        run_in(tmp_path, progress, budget, on_a_made_up_clock(monkeypatch, 0.3, killed_at=30)).train()
+        run_in(tmp_path, progress, budget, on_a_made_up_clock(monkeypatch, lambda _: 0.3, killed_at=30)).train()
     journal = json.loads((tmp_path / "schedule.json").read_text())
-    resumed = run_in(tmp_path, progress, budget, on_a_made_up_clock(monkeypatch, 0.3))
+    resumed = run_in(tmp_path, progress, budget, on_a_made_up_clock(monkeypatch, lambda _: 0.3))
     resumed.train()
     assert [list(decision) for decision in resumed.schedule.revisions][: len(journal)] == journal
     assert number_of(resumed).history[0][:2] == (30, resumed.schedule.progress(30))
@@ -56,7 +61,7 @@ def test_a_resumed_run_in_seconds_keeps_its_clock(tmp_path: Path, progress, monk
 
 
 def test_more_seconds_take_that_long(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
-    make = on_a_made_up_clock(monkeypatch, 0.3)
+    make = on_a_made_up_clock(monkeypatch, lambda _: 0.3)
     first = run_in(tmp_path / "first", progress, TrainingBudget(None, 30.0), make)
     first.train()
     more = run_in(tmp_path / "more", progress, TrainingBudget(None, 30.0, tmp_path / "first"), make)
@@ -74,19 +79,9 @@ def run_on_a_made_up_clock(
     killed_after: float = math.inf,
     checkpoint_seconds: float | None = None,
 ) -> TrainingRun:
-    """``takes(step)`` seconds a step, and no time at all beside the steps."""
-    now = 0.0
-
-    def step_by_step(step: int, lr_scale: float) -> None:
-        nonlocal now
-        if now >= killed_after:
-            raise Killed
-        now += takes(step)
-
-    clock = SimpleNamespace(perf_counter=lambda: now, monotonic=lambda: now)
-    monkeypatch.setattr(loop, "time", clock)
+    make = on_a_made_up_clock(monkeypatch, takes, killed_after=killed_after)
     budget = TrainingBudget(None, seconds)
-    run = run_in(folder, progress, budget, lambda _: OneNumber(0, step_by_step), checkpoint_seconds=checkpoint_seconds)
+    run = run_in(folder, progress, budget, make, checkpoint_seconds=checkpoint_seconds)
     run.train()
     return run
 
