@@ -29,8 +29,8 @@ from stages.io.pixels import load_pixels
 from stages.mesh import Config
 from stages.mesh.extraction import Source, extract_mesh, load
 from stages.mesh.files import ColouredMesh
+from stages.mesh.photos.photo import Photo, photo_of, projected, sampled_picture
 from stages.mesh.rasteriser import barycentric, nearest_faces
-from stages.mesh.texture.photos import Photo, photo_of, projected, sampled_picture
 from stages.render.renderer import load_renderer
 from stages.train.data import scaled_size, view_mask, view_rays
 

@@ -47,9 +47,9 @@ from stages.io.pixels import pillow
 from stages.io.sparse_model import SparseModel
 from stages.mesh.extraction import Source, load
 from stages.mesh.files import ColouredMesh
+from stages.mesh.photos.photo import Photo, photo_of, projected
 from stages.mesh.surface import Surface, vertex_normals
 from stages.mesh.texture.atlas import Atlas, Texture
-from stages.mesh.texture.photos import Photo, photo_of, projected
 from stages.sfm.colmap.models import read_model
 
 MAX_PAIR_PX = 1.0  # between features of two programs that are taken for one

@@ -1,7 +1,8 @@
 """Stage mesh: the field's density becomes a triangle mesh that looks like the photos.
 
 Density on a grid over the region of interest → marching cubes at the iso-level where the photos' rays stop → only what
-the photos see → decimation → holes closed, if asked for → a texture from the photos → GLB, PLY, OBJ, STL, 3MF.
+the photos see → decimation → refinement: moved to where the photos agree → holes closed, if asked for → a texture from
+the photos → GLB, PLY, OBJ, STL, 3MF.
 A surface that leaves the region of interest ends there, open: closing it would invent geometry.
 """
 
@@ -17,7 +18,7 @@ from stages.scale import metres_per_unit
 from stages.train import trained_seconds
 
 INPUTS = ("ingest", "normalise", "scale", "train")
-VERSION = 18
+VERSION = 19
 EXIT_CODE = 17
 RESUMES = False
 PUBLISHED = ("mesh.glb", "mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "mesh.stl", "mesh.3mf")
@@ -70,6 +71,7 @@ class Config(StageConfig):
             "without a texture 300000)."
         ),
     )
+    refine: bool = Field(default=True, description="Move the surface to where the photos agree that it is.")
     close: float = Field(
         default=0.0,
         ge=0,

@@ -1,4 +1,5 @@
-"""From a trained field to a mesh: density grid, iso-level, marching cubes, cleaning, decimation, texture, files."""
+"""From a trained field to a mesh: density grid, iso-level, marching cubes, cleaning, decimation, refinement, texture,
+files."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,23 +20,24 @@ from stages.hardware.memory import available_bytes, check_memory
 from stages.io.field_files import load_field
 from stages.io.files import SMALL_COPY, read_scene, read_tensors, write_png, write_tensors
 from stages.mesh.cleaning import Cleaned, boundary, clean
-from stages.mesh.decimation import decimate
 from stages.mesh.files import WRITERS, Z_UP_TO_Y_UP, ColouredMesh
 from stages.mesh.grid_space import (
     DensityIn,
-    VoxelLengths,
     VoxelSize,
     box_in,
     grid_space,
     in_scene,
     points_of_grid,
 )
-from stages.mesh.holes import Closed, close_holes
 from stages.mesh.iso_level import DIVERGED_HINT, IsoLevel, check_range, choose_iso_level
 from stages.mesh.marching_cubes import extract_surface
+from stages.mesh.photos.refinement import Refined, refine
+from stages.mesh.photos.sightings import Sightings, find_sightings
 from stages.mesh.preview import preview, small_copy
 from stages.mesh.resolution import CHUNK, grid_box, point_cost, slab_factor
 from stages.mesh.surface import Surface, face_areas, is_watertight, keep_faces, vertex_normals
+from stages.mesh.surface.decimation import decimate
+from stages.mesh.surface.holes import Closed, close_holes
 from stages.mesh.texture.texturing import Textured, texture_of
 from stages.mesh.visibility import ShadowMap, sample_rays, shadow_maps, vertex_visibility
 from stages.scale import metres_per_unit
@@ -78,12 +80,13 @@ class Source(NamedTuple):
 
 
 class Extracted(NamedTuple):
-    """``mesh`` in the scene frame, how it came about, what was ``closed``, ``boundary``: where it ends, and the
-    texture with what is known of it. ``voxel`` is in scene units, the median over the vertices."""
+    """``mesh`` in the scene frame, how it came about, what was ``refined`` and ``closed``, ``boundary``: where it ends,
+    and the texture with what is known of it. ``voxel`` is in scene units, the median over the vertices."""
 
     mesh: ColouredMesh
     iso_level: IsoLevel
     cleaned: Cleaned
+    refined: Refined | None
     closed: Closed
     boundary: str
     voxel: float
@@ -124,19 +127,21 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     cropped = _cropped(config, cleaned.surface, source)
     surface = decimate(cropped, config.max_faces or default_faces(config, len(cropped.faces)), source.space)
     ends = boundary(surface, extent, voxel_size, cropped=len(cropped.faces) < len(cleaned.surface.faces))
+    surface, refined, sightings = _refined(config, surface, source, voxel_size, progress)
     if config.close:
         surface, closed = close_holes(surface, config.close)
         ends = "watertight" if is_watertight(surface) else ends
+        sightings = _sightings(config, surface, source, voxel_size, progress)
     else:
         closed = Closed(0, 0, 0.0)
-    progress.update("colours", 0.6)
+    progress.update("colours", 0.7)
     nearest = KDTree(cleaned.surface.vertices).query(surface.vertices)[1]
     directions, of_raw = visibility.direction[cleaned.vertex[nearest]], cleaned.surface.vertices[nearest]
     colours = vertex_colours(source.model, of_raw, directions, voxel_size.at(of_raw).along, source.device)
-    voxels = voxel_size.at(surface.vertices)
-    textured = _textured(config, surface, colours, source, voxels, progress)
+    textured = _textured(config, surface, colours, sightings, progress)
     mesh = ColouredMesh(*surface, vertex_normals(surface), colours, textured and textured.texture)
-    return Extracted(mesh, iso_level, cleaned, closed, ends, float(np.median(voxels.along)), textured)
+    voxel = float(np.median(voxel_size.at(surface.vertices).along))
+    return Extracted(mesh, iso_level, cleaned, refined, closed, ends, voxel, textured)
 
 
 def default_faces(config: "Config", found: int) -> int:
@@ -162,19 +167,51 @@ def _cropped(config: "Config", surface: Surface, source: Source) -> Surface:
     return keep_faces(surface, inside)[0]
 
 
+def _sightings(
+    config: "Config", surface: Surface, source: Source, voxel_size: VoxelSize, progress: Progress
+) -> Sightings | None:
+    """The photos that see the vertices; None where nothing needs them."""
+    if not config.refine and config.texture_size == 0:
+        return None
+
+    def report(done: float) -> None:
+        progress.update("which photos see the surface", 0.55 + 0.1 * done)
+
+    voxels = voxel_size.at(surface.vertices)
+    return find_sightings(surface, source.scene, source.ingest, source.info, voxels, report)
+
+
+def _refined(
+    config: "Config", surface: Surface, source: Source, voxel_size: VoxelSize, progress: Progress
+) -> tuple[Surface, Refined | None, Sightings | None]:
+    """The surface moved to where the photos agree, if asked for, what that gained, and the photos that see it."""
+    sightings = _sightings(config, surface, source, voxel_size, progress)
+    if sightings is None or not config.refine:
+        return surface, None, sightings
+
+    def report(done: float) -> None:
+        progress.update("refining the surface", 0.65 + 0.05 * done)
+
+    refined = refine(surface, sightings, voxel_size.at(surface.vertices), report)
+    if refined is None:
+        progress.note("mesh.not-refined", "two photos see hardly anything of the surface: it is not refined")
+        return surface, None, sightings
+    if not refined.kept:
+        progress.note("mesh.not-refined", "the photos agree no better on the refined surface: it stays as it was")
+    return refined.surface, refined, sightings
+
+
 def _textured(
-    config: "Config", surface: Surface, colours: np.ndarray, source: Source, voxels: VoxelLengths, progress: Progress
+    config: "Config", surface: Surface, colours: np.ndarray, sightings: Sightings | None, progress: Progress
 ) -> Textured | None:
     """The texture asked for; None for one colour per vertex."""
-    if config.texture_size == 0:
+    if config.texture_size == 0 or sightings is None:
         return None
 
     def report(what: str, done: float) -> None:
-        progress.update(what, 0.65 + 0.3 * done)
+        progress.update(what, 0.7 + 0.25 * done)
 
-    textured = texture_of(
-        surface, colours, source.scene, source.ingest, source.info, voxels, config.texture_size, report
-    )
+    textured = texture_of(surface, colours, sightings, config.texture_size, report)
     if textured is None:
         progress.note("mesh.no-photo-sees-it", "no photo sees the surface: it has colours of the field and no texture")
     return textured
@@ -286,26 +323,40 @@ def _facts(config: "Config", extracted: Extracted, source: Source) -> dict[str, 
     """Plain values for the report; lengths are in the frame of the files."""
     unit = source.files_from_scene(config.frame).scale
     mesh, cleaned, iso_level = extracted.mesh, extracted.cleaned, extracted.iso_level
-    return _texture_facts(extracted.textured) | {
-        "vertices": len(mesh.vertices),
-        "faces": len(mesh.faces),
-        "watertight": extracted.boundary == "watertight",
-        "boundary": extracted.boundary,
-        "components_kept": cleaned.kept,
-        "components_dropped": cleaned.dropped,
-        "faces_outside_photos": cleaned.outside,
-        "faces_hidden": cleaned.hidden,
-        "holes_closed": extracted.closed.holes,
-        "holes_left": extracted.closed.left,
-        "invented_area_share": extracted.closed.area_share,
-        "iso_level": iso_level.density,
-        "iso_level_reason": iso_level.reason,
-        "surface_error_voxels": iso_level.surface_error_voxels,
-        "resolution": config.resolution,
-        "voxel": extracted.voxel * unit,
-        "grid_space": grid_space(source.space).kind,
-        "surface_area": float(face_areas(Surface(mesh.vertices, mesh.faces)).sum()) * unit**2,
-        "frame": config.frame,
+    return (
+        _texture_facts(extracted.textured)
+        | _refinement_facts(extracted.refined)
+        | {
+            "vertices": len(mesh.vertices),
+            "faces": len(mesh.faces),
+            "watertight": extracted.boundary == "watertight",
+            "boundary": extracted.boundary,
+            "components_kept": cleaned.kept,
+            "components_dropped": cleaned.dropped,
+            "faces_outside_photos": cleaned.outside,
+            "faces_hidden": cleaned.hidden,
+            "holes_closed": extracted.closed.holes,
+            "holes_left": extracted.closed.left,
+            "invented_area_share": extracted.closed.area_share,
+            "iso_level": iso_level.density,
+            "iso_level_reason": iso_level.reason,
+            "surface_error_voxels": iso_level.surface_error_voxels,
+            "resolution": config.resolution,
+            "voxel": extracted.voxel * unit,
+            "grid_space": grid_space(source.space).kind,
+            "surface_area": float(face_areas(Surface(mesh.vertices, mesh.faces)).sum()) * unit**2,
+            "frame": config.frame,
+        }
+    )
+
+
+def _refinement_facts(refined: Refined | None) -> dict[str, object]:
+    if refined is None:
+        return {"refined_voxels": None}
+    return {
+        "refined_voxels": round(refined.shift, 3),
+        "photo_agreement_before": round(refined.before, 3),
+        "photo_agreement": round(refined.after, 3),
     }
 
 

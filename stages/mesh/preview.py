@@ -6,10 +6,10 @@ from scipy.spatial import KDTree
 from nerf.geometry.camera_paths import levelled
 from nerf.geometry.scene import Scene
 from nerf.geometry.space_maps import SpaceMap
-from stages.mesh.decimation import decimate
 from stages.mesh.files import ColouredMesh
 from stages.mesh.rasteriser import Viewpoint, frame_mesh, rasterise, shade
 from stages.mesh.surface import Surface
+from stages.mesh.surface.decimation import decimate
 
 WIDTH, HEIGHT = 480, 400
 UP = np.array([0.0, 0.0, 1.0])

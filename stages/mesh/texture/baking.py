@@ -18,10 +18,10 @@ import torch
 from scipy.sparse import csr_array
 
 from nerf.runtime.parallel import in_order
+from stages.mesh.photos.photo import Photo, Picture, colours_at, projected, read_picture
 from stages.mesh.rasteriser import barycentric, covered_pixels
 from stages.mesh.surface import Surface
 from stages.mesh.texture.atlas import Atlas
-from stages.mesh.texture.photos import Photo, Picture, colours_at, projected, read_picture
 from stages.mesh.texture.view_selection import Candidates, Choice
 
 LEVELLING_STEPS = 6  # over neighbours, of the differences between photos

@@ -1,19 +1,16 @@
 """The texture of a surface from the training photos: photos chosen, atlas laid out, picture baked."""
 
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from nerf.geometry.scene import Scene
 from stages.hardware.memory import check_memory
-from stages.mesh.grid_space import VoxelLengths
+from stages.mesh.photos.sightings import Sightings
 from stages.mesh.surface import Surface
 from stages.mesh.texture.atlas import Texture, make_atlas
 from stages.mesh.texture.baking import bake
-from stages.mesh.texture.photos import photos_of
-from stages.mesh.texture.view_selection import choose, find_candidates, neighbour_means
+from stages.mesh.texture.view_selection import choose, find_candidates
 
 # Colours as they add up and as bytes, and the nearest texel of each gap: 41 measured at 5794 × 5794.
 BYTES_PER_TEXEL = 42
@@ -32,21 +29,15 @@ class Textured(NamedTuple):
 def texture_of(
     surface: Surface,
     field_colours: np.ndarray,
-    scene: Scene,
-    ingest: Path,
-    field: dict[str, Any],
-    voxels: VoxelLengths,
+    sightings: Sightings,
     max_size: int,
     report: Callable[[str, float], None],
 ) -> Textured | None:
     """The texture of a surface in the scene frame, at most ``max_size`` texels a side. ``field_colours`` (n, 3) sRGB
-    uint8 of the vertices hold where no photo sees them; ``field``: the content of field.json; ``voxels``: how well the
-    surface is known where. None where no photo sees any of the surface. Raises StageError where that is too small,
-    too large for the memory, or a photo is gone."""
-    photos, means = photos_of(scene, ingest, field), neighbour_means(surface)
-    candidates = find_candidates(
-        surface, photos, means, voxels, lambda done: report("choosing photos for the texture", 0.5 * done)
-    )
+    uint8 of the vertices hold where no photo sees them. None where no photo sees any of the surface. Raises StageError
+    where that is too small, too large for the memory, or a photo is gone."""
+    photos, means = sightings.photos, sightings.means
+    candidates = find_candidates(surface, sightings, lambda done: report("choosing photos for the texture", 0.3 * done))
     own = field_colours.astype(np.float32) / 255
     choice = choose(candidates, own, surface.faces, means, len(photos))
     best = np.sqrt(choice.candidates.pixels_of_best())
@@ -54,11 +45,11 @@ def texture_of(
     if not seen.any():
         return None
     least = UNSEEN_DENSITY * float(np.median(best[seen]))
-    report("laying out the texture", 0.5)
+    report("laying out the texture", 0.3)
     atlas = make_atlas(surface, np.maximum(best, least)[surface.faces].max(axis=1), max_size)
     needed, size = BYTES_PER_TEXEL * atlas.width * atlas.height, f"{atlas.width} × {atlas.height}"
     check_memory(
         needed, "the texture", f"{size} texels need", f"Try --mesh.texture-size {max(atlas.width, atlas.height) // 2}."
     )
-    picture = bake(surface, atlas, photos, choice, means, lambda done: report("baking the texture", 0.55 + 0.45 * done))
+    picture = bake(surface, atlas, photos, choice, means, lambda done: report("baking the texture", 0.35 + 0.65 * done))
     return Textured(Texture(atlas, picture), float(1 - seen.mean()), choice.outliers)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from skimage.measure import marching_cubes
 
-from stages.mesh.holes import Closed, close_holes, separated
 from stages.mesh.surface import Surface, face_areas, is_watertight, keep_faces
+from stages.mesh.surface.holes import Closed, close_holes, separated
 
 
 @pytest.fixture(scope="module")

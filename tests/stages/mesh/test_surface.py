@@ -9,7 +9,6 @@ from skimage.measure import marching_cubes
 
 from nerf.fields.density_grid import DensityGrid, occupancy
 from nerf.geometry.space_maps import Box, Ndc
-from stages.mesh.decimation import decimate
 from stages.mesh.marching_cubes import extract_surface
 from stages.mesh.surface import (
     Surface,
@@ -21,6 +20,7 @@ from stages.mesh.surface import (
     sample_surface,
     vertex_normals,
 )
+from stages.mesh.surface.decimation import decimate
 
 LEVEL = 20.0
 SHARPNESS = 0.02

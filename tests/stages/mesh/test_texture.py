@@ -19,12 +19,12 @@ from stages.io.files import write_png
 from stages.io.photos import Photo, write_photos
 from stages.mesh.files import ColouredMesh, glb_bytes, obj_files
 from stages.mesh.grid_space import VoxelLengths
+from stages.mesh.photos.photo import sampled_picture
 from stages.mesh.rasteriser import barycentric, covered_pixels
 from stages.mesh.surface import Surface, vertex_normals
 from stages.mesh.texture.atlas import make_atlas
 from stages.mesh.texture.baking import fill_gutters
 from stages.mesh.texture.charts import cut_into_charts
-from stages.mesh.texture.photos import sampled_picture
 from stages.mesh.texture.texturing import texture_of
 from tests.refusals import refused
 

@@ -104,20 +104,42 @@ def read_picture(photo: Photo, downscale: float) -> Picture:
     width, height = (max(1, round(side / downscale)) for side in (photo.camera.width, photo.camera.height))
     try:
         pixels = load_pixels(photo.folder / photo.view.file, width, height)
-        mask = None if photo.view.mask is None else load_mask(photo.folder / photo.view.mask, width, height)
     except OSError as error:
-        raise StageError(
-            "mesh.photo-unreadable",
-            f"cannot read the photo {photo.view.name}",
-            str(error),
-            "Run stage ingest again (--from ingest), or use --mesh.texture-size 0 for a mesh without texture.",
-        ) from error
+        raise _unreadable(photo, error) from error
+    mask = None if photo.view.mask is None else _mask(photo, width, height)
     used = np.ones((height, width), np.uint8) if mask is None else mask.astype(np.uint8)
     if photo.has_alpha and pixels.shape[2] == 4:
         opaque = (pixels[..., 3] >= OPAQUE_FROM).astype(np.uint8)
         inside = cv2.erode(opaque, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
         used = np.minimum(used, np.asarray(inside, np.uint8))
     return Picture(np.ascontiguousarray(pixels[..., :3]), used)
+
+
+def unmasked(photo: Photo, place: Projection) -> np.ndarray:
+    """Whether the photo's mask counts the pixel of each projected point, (n,) bool. Raises StageError like
+    :func:`read_picture`."""
+    if photo.view.mask is None:
+        return np.ones(len(place.pixels), bool)
+    width, height = photo.camera.width, photo.camera.height
+    column, row = place.pixels.astype(np.int64).clip(0, [width - 1, height - 1]).T
+    return _mask(photo, width, height)[row, column]
+
+
+def _mask(photo: Photo, width: int, height: int) -> np.ndarray:
+    assert photo.view.mask is not None
+    try:
+        return load_mask(photo.folder / photo.view.mask, width, height)
+    except OSError as error:
+        raise _unreadable(photo, error) from error
+
+
+def _unreadable(photo: Photo, error: OSError) -> StageError:
+    return StageError(
+        "mesh.photo-unreadable",
+        f"cannot read the photo {photo.view.name}",
+        str(error),
+        "Run stage ingest again (--from ingest), or use --mesh.no-refine --mesh.texture-size 0, which need no photos.",
+    )
 
 
 def colours_at(photo: Photo, picture: Picture, pixels: np.ndarray, points: np.ndarray) -> np.ndarray:
