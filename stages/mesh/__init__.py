@@ -28,7 +28,10 @@ FLEXIBLE = Flexible(share=0.12, min_seconds=8.0, max_seconds=60.0)
 # Of a texture, besides decoding the photos twice: in all, and of a core for each photo. Fox with 100,000 faces takes 5
 # and 19 s of a core for its 43 training photos (docs/experiments/mesh.md).
 TEXTURE_SECONDS, TEXTURE_SECONDS_PER_PHOTO = 5.0, 0.45
-MIN_SHARE_OF_SHAPE = 0.3  # of a time limit, that a texture leaves
+# Of a refinement, of a core: for 100,000 faces, and for each photo that a texture would have looked through anyway.
+REFINEMENT_SECONDS, REFINEMENT_SECONDS_PER_PHOTO = 6.0, 0.2
+FACES, FACES_WITHOUT_TEXTURE = 100_000, 300_000  # by default, at least
+MIN_SHARE_OF_SHAPE = 0.3  # of a time limit, that refinement and texture leave
 
 Format = Literal["glb", "ply", "obj", "stl", "3mf"]
 Keep = Literal["visible", "largest", "all"]
@@ -102,21 +105,29 @@ class Config(StageConfig):
 
 def expected_seconds(config: Config, workload: Workload) -> float | None:
     """5 s and about a seventh of the training's seconds (fox, fountain_p11 and the demo, after three minutes); for a
-    texture, time for each photo besides."""
+    refinement and a texture, time for each photo besides."""
     if config.seconds is not None:
         return config.seconds
     trained, photos, cores = trained_seconds(workload), workload.photos, workload.cores
-    reading = 0.0 if config.texture_size == 0 else 2 * photos.reading_seconds(cores)
-    return None if trained is None else 5.0 + 0.15 * trained + _texture_seconds(config, photos.number, cores) + reading
+    reads = 2 * (config.texture_size > 0) + config.refine
+    reading = reads * photos.reading_seconds(cores)
+    return None if trained is None else 5.0 + 0.15 * trained + _photo_seconds(config, photos.number, cores) + reading
 
 
-def _texture_seconds(config: Config, photos: int, cores: int) -> float:
-    """What a texture takes, besides decoding the photos."""
-    return 0.0 if config.texture_size == 0 else TEXTURE_SECONDS + TEXTURE_SECONDS_PER_PHOTO * photos / cores
+def _photo_seconds(config: Config, photos: int, cores: int) -> float:
+    """What a refinement and a texture take, besides decoding the photos."""
+    textured, seconds = config.texture_size > 0, 0.0
+    if textured:
+        seconds += TEXTURE_SECONDS + TEXTURE_SECONDS_PER_PHOTO * photos / cores
+    if config.refine:
+        faces = config.max_faces or (FACES if textured else FACES_WITHOUT_TEXTURE)
+        per_photo = 0.0 if textured else REFINEMENT_SECONDS_PER_PHOTO * photos
+        seconds += (REFINEMENT_SECONDS + per_photo) * faces / FACES / cores
+    return seconds
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
-    """Choose the resolution: from the training, or from what a texture leaves of ``seconds`` and the speed of this
+    """Choose the resolution: from the training, or from what refinement and texture leave of ``seconds`` and the speed of this
     machine; and the frame. The number of faces follows from the surface, once that is there."""
     from stages.mesh.resolution import choose_resolution
 
@@ -134,7 +145,7 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
         seconds = config.seconds
         if seconds is not None:
             photos = len(read_scene(inputs["normalise"]).of_split("train"))
-            seconds = max(MIN_SHARE_OF_SHAPE * seconds, seconds - _texture_seconds(config, photos, processors()))
+            seconds = max(MIN_SHARE_OF_SHAPE * seconds, seconds - _photo_seconds(config, photos, processors()))
         resolution = choose_resolution(seconds, inputs, progress)
     return config.model_copy(update={"resolution": resolution, "frame": frame})
 

@@ -104,7 +104,7 @@ def run_mesh(tmp_path, progress, monkeypatch):
         write_json(inputs["train"] / "field.json", info)
         write_json(inputs["scale"] / "scale.json", {"metres_per_unit": metres})
         monkeypatch.setattr(extraction, "load_field", lambda *_: (model, info))
-        config = mesh.Config.model_validate({"resolution": 48, "texture_size": 0} | settings)
+        config = mesh.Config.model_validate({"resolution": 48, "texture_size": 0, "refine": False} | settings)
         return run_stage(mesh, config, inputs, tmp_path / folder, progress), tmp_path / folder
 
     return run

@@ -20,6 +20,7 @@ from stages.io.photos import Photo, write_photos
 from stages.mesh.files import ColouredMesh, glb_bytes, obj_files
 from stages.mesh.grid_space import VoxelLengths
 from stages.mesh.photos.photo import sampled_picture
+from stages.mesh.photos.sightings import find_sightings
 from stages.mesh.rasteriser import barycentric, covered_pixels
 from stages.mesh.surface import Surface, vertex_normals
 from stages.mesh.texture.atlas import make_atlas
@@ -105,7 +106,8 @@ def baked(tmp_path):
     def bake(surface, scene, effects=None, size=512):
         grey = np.full((len(surface.vertices), 3), GREY, np.uint8)
         field = {"effects": effects or {}}
-        found = texture_of(surface, grey, scene, tmp_path, field, known(surface), size, lambda what, done: None)
+        seen = find_sightings(surface, scene, tmp_path, field, known(surface), lambda done: None)
+        found = texture_of(surface, grey, seen, size, lambda what, done: None)
         assert found is not None
         atlas, picture = found.texture
         blocks = list(covered_pixels(atlas.uv[atlas.corner], atlas.width, atlas.height))
@@ -290,7 +292,8 @@ def test_a_photo_that_is_gone_is_named(shoot, baked, tmp_path):
 def test_a_surface_that_no_photo_sees_has_no_texture(shoot, tmp_path):
     turned = sheet()._replace(faces=sheet().faces[:, ::-1])
     grey = np.full((len(turned.vertices), 3), GREY, np.uint8)
-    found = texture_of(turned, grey, shoot(), tmp_path, {"effects": {}}, known(turned), 64, lambda what, done: None)
+    seen = find_sightings(turned, shoot(), tmp_path, {"effects": {}}, known(turned), lambda done: None)
+    found = texture_of(turned, grey, seen, 64, lambda what, done: None)
     assert found is None
 
 
