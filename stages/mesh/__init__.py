@@ -127,8 +127,8 @@ def _photo_seconds(config: Config, photos: int, cores: int) -> float:
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
-    """Choose the resolution: from the training, or from what refinement and texture leave of ``seconds`` and the speed of this
-    machine; and the frame. The number of faces follows from the surface, once that is there."""
+    """Choose the resolution: from the training, or from what refinement and texture leave of ``seconds`` and the speed
+    of this machine; and the frame. The number of faces follows from the surface, once that is there."""
     from stages.mesh.resolution import choose_resolution
 
     metres = metres_per_unit(inputs["scale"])
