@@ -197,7 +197,7 @@ def _refined(
         progress.note("mesh.not-refined", "two photos see hardly anything of the surface: it is not refined")
         return surface, None, sightings
     if not refined.kept:
-        progress.note("mesh.not-refined", "the photos agree no better on the refined surface: it stays as it was")
+        progress.note("mesh.no-better-refined", "the photos agree no better on the refined surface: it stays as it was")
     return refined.surface, refined, sightings
 
 
