@@ -40,7 +40,7 @@ def test_killed_in_every_stage(chain: Chain, tmp_path: Path):
     instants = random.Random(7)
     workspace, struck = tmp_path / "w.nerf", 0
     for stage in usual():
-        struck += kill_in(stage, chain.start(workspace), instants.uniform(0.0, 0.1))
+        struck += kill_in(stage, chain.start(workspace), instants.uniform(0.0, 0.02))
     assert struck >= len(usual()) // 2, "most kills must land inside their stage"
     assert chain.lost(workspace) == []
 
