@@ -131,7 +131,8 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     if config.close:
         surface, closed = close_holes(surface, config.close)
         ends = "watertight" if is_watertight(surface) else ends
-        sightings = _sightings(config, surface, source, voxel_size, progress)
+        if config.texture_size > 0:  # of the new vertices, too
+            sightings = _sightings(surface, source, voxel_size, progress, 0.65)
     else:
         closed = Closed(0, 0, 0.0)
     progress.update("colours", 0.7)
@@ -167,15 +168,11 @@ def _cropped(config: "Config", surface: Surface, source: Source) -> Surface:
     return keep_faces(surface, inside)[0]
 
 
-def _sightings(
-    config: "Config", surface: Surface, source: Source, voxel_size: VoxelSize, progress: Progress
-) -> Sightings | None:
-    """The photos that see the vertices; None where nothing needs them."""
-    if not config.refine and config.texture_size == 0:
-        return None
+def _sightings(surface: Surface, source: Source, voxel_size: VoxelSize, progress: Progress, begin: float) -> Sightings:
+    """The photos that see the vertices; ``begin``: how far the stage is."""
 
     def report(done: float) -> None:
-        progress.update("which photos see the surface", 0.55 + 0.1 * done)
+        progress.update("which photos see the surface", begin + 0.05 * done)
 
     voxels = voxel_size.at(surface.vertices)
     return find_sightings(surface, source.scene, source.ingest, source.info, voxels, report)
@@ -184,13 +181,16 @@ def _sightings(
 def _refined(
     config: "Config", surface: Surface, source: Source, voxel_size: VoxelSize, progress: Progress
 ) -> tuple[Surface, Refined | None, Sightings | None]:
-    """The surface moved to where the photos agree, if asked for, what that gained, and the photos that see it."""
-    sightings = _sightings(config, surface, source, voxel_size, progress)
-    if sightings is None or not config.refine:
+    """The surface moved to where the photos agree, if asked for, what that gained, and the photos that see it: None
+    where neither this nor a texture needs them."""
+    if not config.refine and config.texture_size == 0:
+        return surface, None, None
+    sightings = _sightings(surface, source, voxel_size, progress, 0.55)
+    if not config.refine:
         return surface, None, sightings
 
     def report(done: float) -> None:
-        progress.update("refining the surface", 0.65 + 0.05 * done)
+        progress.update("refining the surface", 0.6 + 0.05 * done)
 
     refined = refine(surface, sightings, voxel_size.at(surface.vertices), report)
     if refined is None:

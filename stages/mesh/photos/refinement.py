@@ -26,7 +26,7 @@ from scipy.sparse.linalg import cg
 
 from nerf.runtime.parallel import in_order
 from stages.mesh.grid_space import VoxelLengths
-from stages.mesh.photos.photo import Photo, Picture, projected, read_picture
+from stages.mesh.photos.photo import Photo, projected, read_picture
 from stages.mesh.photos.sightings import Sightings, smooth_normals
 from stages.mesh.surface import Surface, face_area_vectors
 
@@ -52,9 +52,9 @@ class Sweep(NamedTuple):
     reach: float
     steps: int
 
-    def offsets(self) -> np.ndarray:
-        """From the inside to the outside, (2 steps + 1,)."""
-        return np.linspace(-self.reach, self.reach, 2 * self.steps + 1, dtype=np.float32)
+    def places(self) -> np.ndarray:
+        """The offsets from the inside to the outside, in reaches: -1 … 1, (2 steps + 1,)."""
+        return np.arange(-self.steps, self.steps + 1, dtype=np.float32) / max(self.steps, 1)
 
 
 COARSE, FINE = Sweep(1.5, 2.0, 8), Sweep(1.0, 0.75, 4)
@@ -94,6 +94,10 @@ class Patches(NamedTuple):
     across: np.ndarray
     normal: np.ndarray
 
+    def shared(self) -> np.ndarray:
+        """Whether two photos show a vertex, (n,) bool."""
+        return (self.photos >= 0).sum(axis=1) > 1
+
 
 def refine(
     surface: Surface, sightings: Sightings, voxels: VoxelLengths, report: Callable[[float], None]
@@ -101,20 +105,22 @@ def refine(
     """Move the vertices of a surface; faces stay. ``voxels``: how well each vertex is known. None where two photos show
     hardly anything of it. Raises StageError where a photo is gone."""
     photos = _photos_apart(surface, sightings)
-    seen = (photos >= 0).sum(axis=1) > 1
+    patches = _patches(surface, sightings, photos, voxels)
+    seen = patches.shared()
     if seen.sum() < MIN_SEEN:
         return None
     fine = _pictures(surface, sightings, photos, voxels, report)
-    coarse = [_coarser(grey) for grey in fine]
-    moved, before = surface, _in_place(surface, sightings, photos, voxels, fine)[seen]
+    coarse = {number: _coarser(grey) for number, grey in fine.items()}
+    before = _agreement(patches, fine, IN_PLACE)[seen]
+    moved = surface
     for sweep, pictures, done in ((COARSE, coarse, 0.7), (FINE, fine, 0.95)):
-        patches = _patches(moved, sightings, photos, voxels)
         offset, worth = _best_offsets(_agreement(patches, pictures, sweep), sweep, sightings.means)
         step = _balanced(moved, patches, offset, worth, sightings.means).clip(-sweep.reach, sweep.reach)
         shifted = moved.vertices + patches.normals * (step * patches.normal)[:, None]
         moved = Surface(_unturned(moved, shifted), moved.faces)
+        patches = _patches(moved, sightings, photos, voxels)
         report(done)
-    after = _in_place(moved, sightings, photos, voxels, fine)[seen]
+    after = _agreement(patches, fine, IN_PLACE)[seen]
     shift = (np.linalg.norm(moved.vertices - surface.vertices, axis=1) / voxels.across)[seen]
     refined = Refined(moved, float(np.median(shift)), float(before.mean()), float(after.mean()))
     return refined if refined.kept else refined._replace(surface=surface, shift=0.0)
@@ -123,8 +129,7 @@ def refine(
 def _photos_apart(surface: Surface, sightings: Sightings) -> np.ndarray:
     """For each vertex the best photo, then by turns the best of the others times how far apart it looks from."""
     count, slots = sightings.number.shape
-    centres = np.array([photo.view.scene_from_camera[:, 3] for photo in sightings.photos])
-    towards = centres[sightings.number] - surface.vertices[:, None]
+    towards = sightings.centres()[sightings.number] - surface.vertices[:, None]
     towards = (towards / np.linalg.norm(towards, axis=2, keepdims=True)).astype(np.float32)
     found, row = np.full((count, USED_PHOTOS), -1), np.arange(count)
     gain = np.where(sightings.whole, sightings.quality, 0)
@@ -140,32 +145,27 @@ def _photos_apart(surface: Surface, sightings: Sightings) -> np.ndarray:
 
 def _pictures(
     surface: Surface, sightings: Sightings, photos: np.ndarray, voxels: VoxelLengths, report: Callable[[float], None]
-) -> list[Grey]:
-    """Each photo at a size at which samples of the fine patches are PIXELS_PER_SAMPLE apart."""
-    downscale, pixels = [], 0.0
-    for number, photo in enumerate(sightings.photos):
-        vertex = np.flatnonzero((photos == number).any(axis=1))
-        apart = 1.0
-        if len(vertex):
-            distance = np.linalg.norm(surface.vertices[vertex] - photo.view.scene_from_camera[:, 3], axis=1)
-            apart = 2 * FINE.half / (SIDE - 1) * float(np.median(voxels.across[vertex] / distance)) * photo.focal_px
-        downscale.append(max(1.0, apart / PIXELS_PER_SAMPLE))
-        pixels += photo.camera.width * photo.camera.height / downscale[-1] ** 2
+) -> dict[int, Grey]:
+    """Each photo that shows a vertex, at a size at which samples of the fine patches are PIXELS_PER_SAMPLE apart."""
+    centres, downscale, pixels = sightings.centres(), dict[int, float](), 0.0
+    for number in np.unique(photos[photos >= 0]).tolist():
+        photo, vertex = sightings.photos[number], np.flatnonzero((photos == number).any(axis=1))
+        distance = np.linalg.norm(surface.vertices[vertex] - centres[number], axis=1)
+        apart = 2 * FINE.half / (SIDE - 1) * float(np.median(voxels.across[vertex] / distance)) * photo.focal_px
+        downscale[number] = max(1.0, apart / PIXELS_PER_SAMPLE)
+        pixels += photo.camera.width * photo.camera.height / downscale[number] ** 2
     smaller = max(1.0, (2 * pixels / MAX_PICTURE_BYTES) ** 0.5)
 
     def read(number: int) -> Grey:
-        picture = read_picture(sightings.photos[number], smaller * downscale[number])
-        return _grey(sightings.photos[number], picture)
+        photo = sightings.photos[number]
+        picture = read_picture(photo, smaller * downscale[number])
+        return Grey(photo, np.asarray(cv2.cvtColor(picture.pixels, cv2.COLOR_RGB2GRAY)), picture.used)
 
-    found = []
-    for grey in in_order(read, range(len(downscale)), torch.device("cpu")):
-        found.append(grey)
+    found = dict[int, Grey]()
+    for number, grey in zip(downscale, in_order(read, downscale, torch.device("cpu")), strict=True):
+        found[number] = grey
         report(0.3 * len(found) / len(downscale))
     return found
-
-
-def _grey(photo: Photo, picture: Picture) -> Grey:
-    return Grey(photo, np.asarray(cv2.cvtColor(picture.pixels, cv2.COLOR_RGB2GRAY)), picture.used)
 
 
 def _coarser(grey: Grey) -> Grey:
@@ -178,21 +178,13 @@ def _coarser(grey: Grey) -> Grey:
 
 def _patches(surface: Surface, sightings: Sightings, photos: np.ndarray, voxels: VoxelLengths) -> Patches:
     normals = smooth_normals(surface, sightings.means)
-    centres = np.array([photo.view.scene_from_camera[:, 3] for photo in sightings.photos])
-    sight = surface.vertices - centres[photos[:, 0].clip(0)]
+    sight = surface.vertices - sightings.centres()[photos[:, 0].clip(0)]
     cosine = (sight * normals).sum(axis=1) / np.maximum(np.linalg.norm(sight, axis=1), np.finfo(float).tiny)
     normal = np.sqrt((cosine * voxels.along) ** 2 + (1 - cosine**2).clip(0) * voxels.across**2)
     return Patches(surface.vertices, normals, photos, voxels.across, normal)
 
 
-def _in_place(
-    surface: Surface, sightings: Sightings, photos: np.ndarray, voxels: VoxelLengths, pictures: list[Grey]
-) -> np.ndarray:
-    """How well the photos agree where the vertices are, (n,)."""
-    return _agreement(_patches(surface, sightings, photos, voxels), pictures, IN_PLACE)[:, 0]
-
-
-def _agreement(patches: Patches, pictures: list[Grey], sweep: Sweep) -> np.ndarray:
+def _agreement(patches: Patches, pictures: dict[int, Grey], sweep: Sweep) -> np.ndarray:
     """The agreement of the photos at every vertex and offset, (n, offsets); 0 where fewer than two see it."""
     order = np.lexsort(patches.photos.T[::-1])  # those that the same photos show
 
@@ -206,12 +198,12 @@ def _agreement(patches: Patches, pictures: list[Grey], sweep: Sweep) -> np.ndarr
     return curves
 
 
-def _chunk_agreement(patches: Patches, pictures: list[Grey], sweep: Sweep) -> np.ndarray:
+def _chunk_agreement(patches: Patches, pictures: dict[int, Grey], sweep: Sweep) -> np.ndarray:
     """Of patches p of unit norm, the mean product of all pairs is (|Σ p|² − Σ |p|²) / (k (k − 1))."""
     shape = len(patches.points), 2 * sweep.steps + 1
     total, own = np.zeros((*shape, SIDE * SIDE), np.float32), np.zeros(shape, np.float32)
     count = np.zeros(shape[0], np.float32)
-    for number in np.unique(patches.photos[patches.photos >= 0]):
+    for number in np.unique(patches.photos[patches.photos >= 0]).tolist():
         vertex = np.flatnonzero((patches.photos == number).any(axis=1))
         which, shown = _shown(Patches(*(part[vertex] for part in patches)), pictures[number], sweep)
         vertex = vertex[which]
@@ -241,7 +233,7 @@ def _shown(patches: Patches, grey: Grey, sweep: Sweep) -> tuple[np.ndarray, np.n
     """What a photo shows of patches at each offset, (m, offsets, SIDE²) float32, and which patches these are: those
     before the camera and not masked."""
     which, at = _placed(patches, grey, sweep)
-    along = np.linspace(-1, 1, 2 * sweep.steps + 1, dtype=np.float32)[:, None] if sweep.steps else np.zeros((1, 1))
+    along = sweep.places()[:, None]
     centre = at.middle[:, None] + along * at.along[:, None] + along**2 * at.bend[:, None]
     a, b = (each.reshape(-1, 1) for each in np.meshgrid(*2 * [np.linspace(-1, 1, SIDE, dtype=np.float32)]))
     samples = centre[:, :, None] + (a * at.across[:, None] + b * at.up[:, None])[:, None]
@@ -318,7 +310,7 @@ def _balanced(
     aligned = (patches.normals[row] * patches.normals[column]).sum(axis=1)
     fair = csr_array((FAIRNESS * bending.data * aligned, (row, column)), (count, count))
     known = FAIRNESS * (patches.normals * (pull @ surface.vertices)).sum(axis=1)
-    stay = np.where((patches.photos >= 0).sum(axis=1) > 1, PRIOR, UNSEEN)
+    stay = np.where(patches.shared(), PRIOR, UNSEEN)
     smooth = SMOOTHNESS * (diags_array(degree + 1) - linked)
     system = (fair + smooth + diags_array(worth + stay)).tocsr()
     return cg(system, worth * offset - known, rtol=TOLERANCE, maxiter=MAX_ITERATIONS)[0]

@@ -43,6 +43,10 @@ class Sightings(NamedTuple):
     quality: np.ndarray
     whole: np.ndarray
 
+    def centres(self) -> np.ndarray:
+        """Where the photos were taken, (photos, 3)."""
+        return np.array([photo.view.scene_from_camera[:, 3] for photo in self.photos])
+
 
 class Sight(NamedTuple):
     """How one photo shows the vertices, (n,) each, as in :class:`Sightings`."""

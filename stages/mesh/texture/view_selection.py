@@ -69,7 +69,7 @@ def find_candidates(surface: Surface, sightings: Sightings, on_photo: Callable[[
 
     def shown_by(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         photo = sightings.photos[number]
-        vertex, slot = np.nonzero((sightings.number == number) & (quality > 0))
+        vertex, slot = np.nonzero((sightings.number == number) & (sightings.quality > 0))
         if len(vertex) == 0:
             return vertex, slot, np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
         points = surface.vertices[vertex]
