@@ -1,10 +1,13 @@
 """How far the cameras that stage sfm finds are from measured ones, or from those that came with the photos.
 
-    python benchmarks/sfm_accuracy.py DATA [--camera-model OPENCV] [--sets fountain_p11 herzjesu_p8 fox]
+    python -m benchmarks.sfm_accuracy DATA [--camera-model OPENCV] [--sets fountain_p11 herzjesu_p8 fox] [--turned 3]
 
 DATA holds a folder per set: photos, and reference_cameras.json with K (px), world_from_camera_rotation and
 camera_center_m for each. Printed are the mean and largest distance of the camera centres after the similarity that
 fits them best, and the mean angle between the rotations, beside the seconds that sfm took.
+
+With --turned every so manyth photo is as if it had been held upright: its file says so in EXIF, its pixels stay. What
+is measured there knows nothing of EXIF, and so cameras are turned back for it.
 
 A set with a transforms.json instead, and photos in images/, has no truth but the cameras of another program: how far
 both agree, centres in percent of the largest distance between two of the given ones.
@@ -30,25 +33,49 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import ExifTags, Image
 
 from benchmarks.record import Record, add_out
 from nerf.geometry.alignment import align
 from pipeline.cli.terminal import PlainDisplay
 from stages import ingest, sfm
 from stages.contract import run_stage
+from stages.ingest.orientation import QUARTER_TURNS
 from stages.io.photos import Photo, read_photos
 from stages.io.sparse_model import SparseModel
+from stages.sfm.colmap.cameras import turned_pose
 from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.pose_files import read_poses
 
+UPRIGHT_HELD = 6  # EXIF's orientation
+APP1 = b"\xff\xe1"  # the marker of a JPEG's segment with EXIF
 
-def errors(model: SparseModel, reference: dict[str, dict[str, list]]) -> tuple[np.ndarray, np.ndarray]:
-    """Distances of the centres in millimetres and angles between the rotations in degrees, per photo."""
+
+def errors(
+    model: SparseModel, reference: dict[str, dict[str, list]], turns: dict[str, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distances of the centres in millimetres and angles between the rotations in degrees, per photo; ``turns``: by
+    file, how many quarter turns clockwise made it upright."""
     measured = [reference[image.file] for image in model.images]
     rotations = np.array([camera["world_from_camera_rotation"] for camera in measured])
     centres = np.array([camera["camera_center_m"] for camera in measured])
-    distances, degrees = apart(model, np.concatenate([rotations, centres[:, :, None]], axis=2))
+    poses = np.concatenate([rotations, centres[:, :, None]], axis=2)
+    upright = [turned_pose(pose, turns[image.file]) for pose, image in zip(poses, model.images, strict=True)]
+    distances, degrees = apart(model, np.stack(upright))
     return 1000 * distances, degrees
+
+
+def write_turned(photos: Path, folder: Path, every: int) -> None:
+    """Copy JPEGs of landscape photos; every so manyth says that it was held upright."""
+    folder.mkdir()
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = UPRIGHT_HELD
+    segment = exif.tobytes()
+    for number, photo in enumerate(sorted(photos.rglob("*.jpg"))):
+        content = photo.read_bytes()
+        if number % every == every - 1:
+            content = content[:2] + APP1 + (len(segment) + 2).to_bytes(2, "big") + segment + content[2:]
+        (folder / photo.name).write_bytes(content)
 
 
 def apart(model: SparseModel, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -72,13 +99,16 @@ def agreement(model: SparseModel, transforms: Path, photos: list[Photo]) -> tupl
     return 100 * distances / size, degrees
 
 
-def measure(data: Path, config: sfm.Config) -> dict[str, Any]:
+def measure(data: Path, config: sfm.Config, turned: int | None) -> dict[str, Any]:
     """Run ingest and sfm on one set; its row of the table."""
     transforms = data / "transforms.json"
     with tempfile.TemporaryDirectory() as scratch:
         folders = {name: Path(scratch, name) for name in ("ingest", "sfm")}
         folders["ingest"].mkdir()
         photos = data / "images" if transforms.exists() else data
+        if turned:
+            write_turned(photos, Path(scratch, "turned"), turned)
+            photos = Path(scratch, "turned")
         ingest.run(ingest.Config(photos=photos), {}, folders["ingest"], PlainDisplay())
         begin = time.perf_counter()
         result = run_stage(sfm, config, folders, folders["sfm"], PlainDisplay())
@@ -87,13 +117,16 @@ def measure(data: Path, config: sfm.Config) -> dict[str, Any]:
         if transforms.exists():
             unit, (off, degrees) = "percent", agreement(model, transforms, read_photos(folders["ingest"]))
         else:
-            unit, (off, degrees) = "mm", errors(model, json.loads((data / "reference_cameras.json").read_text()))
+            reference = json.loads((data / "reference_cameras.json").read_text())
+            turns = {photo.image_name: QUARTER_TURNS[photo.orientation] for photo in read_photos(folders["ingest"])}
+            unit, (off, degrees) = "mm", errors(model, reference, turns)
     return {
         "set": data.name,
+        **({"turned": turned} if turned else {}),
         "registered": len(model.images),
-        f"centres_{unit}": off.mean(),
-        f"centres_max_{unit}": off.max(),
-        "rotations_deg": degrees.mean(),
+        f"centres_{unit}": round(float(off.mean()), 3),
+        f"centres_max_{unit}": round(float(off.max()), 3),
+        "rotations_deg": round(float(degrees.mean()), 4),
         "seconds": round(seconds),
         "found": result.line,
     }
@@ -107,13 +140,14 @@ def main() -> None:
     parser.add_argument("--camera-model", default=None)
     parser.add_argument("--max-features", type=int, default=None)
     parser.add_argument("--max-image-size", type=int, default=None)
+    parser.add_argument("--turned", type=int, default=None)
     add_out(parser)
     arguments = parser.parse_args()
     record = Record(arguments.out)
     given = {name: getattr(arguments, name) for name in ("camera_model", "max_features", "max_image_size")}
     config = sfm.Config(**given)
     for name in arguments.sets:
-        record.add(**measure(arguments.data / name, config))
+        record.add(**measure(arguments.data / name, config, arguments.turned))
 
 
 if __name__ == "__main__":

@@ -93,7 +93,7 @@ class _Taken:
         """Photos of equal ``camera`` share intrinsics. Where EXIF does not say which camera it was, the folder is all
         that tells."""
         known = self.camera_key.make or self.camera_key.model or self.camera_key.lens
-        return self.camera_key, "" if known else str(Path(self.name).parent)
+        return self.camera_key.sensor(), "" if known else str(Path(self.name).parent)
 
 
 class Converted(NamedTuple):

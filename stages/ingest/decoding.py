@@ -23,7 +23,7 @@ from stages.ingest.exif import (
     read_exif,
 )
 from stages.ingest.listing import RAW_EXTENSIONS
-from stages.ingest.orientation import turned_size, upright
+from stages.ingest.orientation import QUARTER_TURNS, turned_size, upright
 from stages.ingest.panoramas import is_panorama
 from stages.io.files import stand_in
 from stages.io.pixels import pillow
@@ -51,9 +51,9 @@ class DecodeError(Exception):
 
 
 class CameraKey(NamedTuple):
-    """Photos for which all of this agrees share intrinsics. Orientation counts: it moves the principal point.
+    """What tells the camera of an upright photo of ``width`` × ``height``, whose EXIF ``orientation`` was undone.
 
-    ``focal_px`` is for pixels of ``width`` × ``height``, None where EXIF tells none or one out of FOCAL_RANGE.
+    ``focal_px`` is for pixels of this size, None where EXIF tells none or one out of FOCAL_RANGE.
     """
 
     make: str
@@ -64,6 +64,14 @@ class CameraKey(NamedTuple):
     orientation: int
     focal_mm: float | None
     focal_px: float | None
+
+    def sensor(self) -> "CameraKey":
+        """Photos for which this agrees share intrinsics: the same however the camera was held. Mirrored photos share
+        none with others: no camera mirrors."""
+        if self.orientation not in QUARTER_TURNS:
+            return self
+        width, height = turned_size((self.width, self.height), self.orientation)
+        return self._replace(width=width, height=height, orientation=1)
 
 
 @dataclass(frozen=True)

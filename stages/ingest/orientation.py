@@ -1,12 +1,13 @@
 """EXIF orientation (EXIF 2.32, tag 0x0112; read in exif.py) undone: pixels and sizes of photos turned upright.
 
-Imported cameras of photos as they are stored are turned with them: stages/sfm/imported/orientation.py.
+Cameras of photos as they are stored are turned with them: stages/sfm/colmap/cameras.py.
 """
 
 from PIL import Image
 
 from stages.io.pixels import pillow
 
+QUARTER_TURNS = {1: 0, 6: 1, 3: 2, 8: 3}  # clockwise, that make a stored photo upright; the other orientations mirror
 FIRST_SIDEWAYS = 5  # from here on width and height change places
 
 

@@ -15,10 +15,11 @@ Box = tuple[float, float, float, float]
 class Photo:
     """One decoded photo, upright, 8-bit sRGB.
 
-    Photos of equal ``camera_group`` share intrinsics. ``focal_px`` is the focal length that EXIF tells, at this
-    size, and ``focal_source`` the tag it came from; both None where EXIF tells none. ``sharpness`` is the variance
-    of the Laplacian; it compares photos of one set and means nothing by itself. ``relative_sharpness`` is it over the
-    median of its neighbours' (stages/ingest/sharpness.py), None where there are too few.
+    Photos of equal ``camera_group`` share intrinsics, turned with them where ``orientation`` differs. ``focal_px`` is
+    the focal length that EXIF tells, at this size, and ``focal_source`` the tag it came from; both None where EXIF
+    tells none. ``sharpness`` is the variance of the Laplacian; it compares photos of one set and means nothing by
+    itself. ``relative_sharpness`` is it over the median of its neighbours' (stages/ingest/sharpness.py), None where
+    there are too few.
 
     ``mask`` is a grey PNG of the photo's size, 255 where it is to be used and 0 where it is to be ignored; None: all of
     it is used. ``near_duplicate_of`` is the name of the photo that is nearly the same picture, which is used in its

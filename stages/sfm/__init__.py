@@ -19,7 +19,7 @@ from stages.io.files import write_json
 from stages.sfm.pairs import MAX_EXHAUSTIVE, Matcher
 
 INPUTS = ("ingest",)
-VERSION = 30
+VERSION = 31
 EXIT_CODE = 11
 RESUMES = True
 PUBLISHED = ("sparse", "registration.json")

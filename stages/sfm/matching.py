@@ -82,11 +82,12 @@ def match_photos(strategy: Strategy, missing: list[int], state: JobState) -> tup
 
 def _extract(database: Path, extraction: ExtractionOptions, state: JobState) -> None:
     state.begin("features", database=str(database))
-    fill_database(database, state.photos, state.job.camera_model or MAPPING_MODEL, state.job.camera_params)
+    model = state.job.camera_model or MAPPING_MODEL
+    fill_database(database, state.photos, model, state.job.camera_params, state.turns)
     masks = Path(state.job.folder, "masks")
     if write_feature_masks(state.images.parent, state.photos, masks):
         extraction = extraction._replace(masks=masks)
-    extract_features(database, state.images, state.photos, extraction, partial(_note_few_features, state))
+    extract_features(database, state.images, state.photos, extraction, partial(_note_few_features, state), state.turns)
     shutil.rmtree(masks, ignore_errors=True)
     state.end("features")
 

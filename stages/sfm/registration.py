@@ -34,13 +34,15 @@ OVERLAP_HINT = "Take photos with 60–80 % overlap, so that each point is visibl
 class Matches:
     """The verified among ``tried`` pairs of photos; photos are numbered from 0 in order of ``file``.
 
-    ``planar``: a plane or a pure rotation explains the pair (COLMAP's PLANAR_OR_PANORAMIC), so it tells nothing of
-    depth; ``homography`` is that map (zero where there is none). ``forward``: forward motion, towards something in the
-    picture or away from it. ``shift_px``: median distance between matched keypoints.
+    ``sizes``: their widths and heights as their cameras have them. ``planar``: a plane or a pure rotation explains the
+    pair (COLMAP's PLANAR_OR_PANORAMIC), so it tells nothing of depth; ``homography`` is that map (zero where there is
+    none). ``forward``: forward motion, towards something in the picture or away from it. ``shift_px``: median distance
+    between matched keypoints.
     """
 
     keypoints: Int[np.ndarray, "photos"]
     tried: int
+    sizes: Int[np.ndarray, "photos 2"]
     pairs: Int[np.ndarray, "pairs 2"]
     planar: Bool[np.ndarray, "pairs"]
     homography: Float[np.ndarray, "pairs 3 3"]
@@ -107,6 +109,7 @@ def read_matches(database: Path) -> Matches:
     return Matches(
         keypoints=np.array(keypoints, int).reshape(-1),
         tried=tried,
+        sizes=sizes,
         pairs=pairs,
         planar=planar,
         homography=_matrices([blob for *_, blob, _ in verified]),
@@ -256,9 +259,8 @@ def why_no_model(photos: Sequence[Photo], matches: Matches, registered: int, poi
 
 def _no_depth(what: str, photos: Sequence[Photo], matches: Matches) -> StageError | None:
     """The error where most pairs are degenerate, by kind."""
-    sizes = np.array([(photo.width, photo.height) for photo in photos])
     count, planar, forward = len(matches.pairs), int(matches.planar.sum()), int(matches.forward.sum())
-    rotations = count_pure_rotations(matches.homography[matches.planar], sizes[matches.pairs[matches.planar]])
+    rotations = count_pure_rotations(matches.homography[matches.planar], matches.sizes[matches.pairs[matches.planar]])
     if planar > count / 2 and rotations > planar / 2:
         return StageError(
             "sfm.pure-rotation",

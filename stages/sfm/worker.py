@@ -20,7 +20,7 @@ from stages.io.files import make_durable
 from stages.sfm.checked_mapping import register_missing, run_mapping
 from stages.sfm.colmap.diagnosis import find_conflict, links, supports
 from stages.sfm.colmap.final_bundle_adjustment import final_bundle_adjustment
-from stages.sfm.colmap.models import load_native, write_native
+from stages.sfm.colmap.models import load_native, turned_upright, write_native
 from stages.sfm.colmap.repair import check_model, deregister, facts, reasons
 from stages.sfm.job import Job, JobState, Send, end_with_parent
 from stages.sfm.matching import capture_sequence, match_photos
@@ -88,11 +88,12 @@ def reconstruct(job: Job, send: Send) -> dict[str, Any]:
     model = finished.model
     checked, left_out = _last_check(model, database, state)
     checked["doubtful"] = sorted({*checked["doubtful"], *({*best.excluded, *left_out} - {*_files(model)})})
-    if state.thinned:  # mapping leaves colours out
-        model.extract_colors_for_all_images(state.images)
+    upright = turned_upright(model, state.turns) if state.turns else model
+    if state.thinned or state.turns:  # mapping leaves colours out, or takes them from the wrong places
+        upright.extract_colors_for_all_images(state.images)
     left_out = best.excluded | finished.left_out | left_out
     registered = [model.image(i) for i in sorted(model.reg_image_ids())]
-    write_native(Path(job.folder, "sparse"), model)
+    write_native(Path(job.folder, "sparse"), upright)
     return {
         "database": str(database),
         **tried,

@@ -9,6 +9,10 @@ from stages.contract import StageError
 
 ROUND_TRIP_PX = 0.01  # a ray direction that does not project back to its pixel is a false root of the distortion
 CHECKED_PIXELS = (33, 25)  # across and down, the very corners among them: there lenses bend most
+_CLOCKWISE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # of a picture, by a quarter turn
+# Parameters of COLMAP's lenses that are the two parts of a vector in the picture, and turn with it. Tangential terms
+# are 2 (q·u) u + |u|² q of u = (X, Y) / Z (of the angle for a fisheye), and OPENCV calls q (p2, p1).
+_VECTORS = (("p2", "p1"), ("p0", "p1"), ("sx1", "sy1"), ("s0", "s2"), ("s1", "s3"))
 
 
 def camera_rays(camera: Camera, width: int, height: int) -> Float[np.ndarray, "height width 3"]:
@@ -101,6 +105,41 @@ def rescaled(camera: Camera, width: int, height: int) -> Camera:
     model = native(camera)
     model.rescale(width, height)
     return plain(model)
+
+
+def turned_camera(camera: Camera, turns: int) -> Camera:
+    """The camera of the picture after so many quarter turns clockwise.
+
+    One takes pixel (x, y) of a picture of height h to (h − y, x), and a camera's axes with it: X' = −Y, Y' = X.
+    """
+    names = native(camera).params_info.split(", ")
+    for _ in range(turns):
+        old = dict(zip(names, camera.params, strict=True))
+        new = old | {"cx": camera.height - old["cy"], "cy": old["cx"]}
+        if "fx" in old:
+            new |= {"fx": old["fy"], "fy": old["fx"]}
+        for across, down in _VECTORS:
+            if across in old and down in old:
+                new |= {across: -old[down], down: old[across]}
+        camera = Camera(camera.model, camera.height, camera.width, tuple(new[name] for name in names))
+    return camera
+
+
+def turned_pose(world_from_camera: Float[np.ndarray, "3 4"], turns: int) -> Float[np.ndarray, "3 4"]:
+    """The pose of a camera after so many quarter turns clockwise of its picture."""
+    rotation = world_from_camera[:, :3] @ np.linalg.matrix_power(_CLOCKWISE, turns).T
+    return np.concatenate([rotation, world_from_camera[:, 3:]], axis=1)
+
+
+def pixel_map(camera: Camera, turns: int, width: int, height: int) -> Float[np.ndarray, "2 3"]:
+    """Takes pixels (x, y, 1) of the camera to those of its picture after so many quarter turns clockwise and resized to
+    width × height."""
+    pixels, size = np.eye(3), (camera.width, camera.height)
+    for _ in range(turns):
+        turn = _CLOCKWISE.copy()
+        turn[0, 2] = size[1]
+        pixels, size = turn @ pixels, size[::-1]
+    return np.diag([width / size[0], height / size[1]]) @ pixels[:2]
 
 
 def is_valid(camera: Camera) -> bool:

@@ -4,7 +4,8 @@ import math
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
@@ -19,6 +20,7 @@ from jaxtyping import Bool
 from stages.hardware import cluster
 from stages.hardware.device import processors
 from stages.hardware.memory import at_once, available_bytes
+from stages.ingest.orientation import QUARTER_TURNS
 from stages.io.photos import Photo, spread
 from stages.sfm.pairs.feature_matching import IndexedFeatures, index_features, match_descriptors, match_indexed
 from stages.sfm.pairs.image_retrieval import WORDS, Words, photo_similarity, vocabulary
@@ -43,6 +45,12 @@ OPENINGS, PAUSE_SECONDS = 50, 0.1  # a reader holds the lock for milliseconds
 MIN_CACHED_PHOTOS, CACHE_SHARE = 256, 0.25
 
 
+Turns = Mapping[str, int]
+"""By image name, of photos that were turned so, how many quarter turns clockwise made them upright. Their cameras see
+them as the sensor has them, without."""
+UPRIGHT: Turns = {}
+
+
 def keep_open(database: Path) -> pycolmap.Database:
     """A connection to keep for as long as another process reads along.
 
@@ -57,8 +65,20 @@ def keep_open(database: Path) -> pycolmap.Database:
     return pycolmap.Database.open(database)
 
 
+def turns_of_cameras(photos: Sequence[Photo]) -> Turns:
+    """The turns of photos whose camera was held in several ways: upright, such a camera has as many sizes and principal
+    points, while on the sensor all its photos tell the same intrinsics."""
+    ways = Counter(group for group, _ in {(photo.camera_group, photo.orientation) for photo in photos})
+    turned = [photo for photo in photos if photo.orientation != 1 and ways[photo.camera_group] > 1]
+    return {photo.image_name: QUARTER_TURNS[photo.orientation] for photo in turned}
+
+
 def fill_database(
-    database: Path, photos: Sequence[Photo], camera_model: str, camera_params: Sequence[float] | None = None
+    database: Path,
+    photos: Sequence[Photo],
+    camera_model: str,
+    camera_params: Sequence[float] | None = None,
+    turns: Turns = UPRIGHT,
 ) -> None:
     """Enter photos (in order of ``file``) and one camera per camera group, all or nothing.
 
@@ -67,12 +87,17 @@ def fill_database(
     with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
         if db.num_images():
             return
-        camera_ids: dict[int, int] = {}
+        camera_ids: dict[tuple[int, int | None], int] = {}
         for image_id, photo in enumerate(photos, start=1):
-            group = 0 if camera_params else photo.camera_group
+            # As they are upright, photos that a camera took held otherwise have intrinsics of their own.
+            held = None if camera_params or turns else photo.orientation
+            group = (0 if camera_params else photo.camera_group, held)
             if group not in camera_ids:
                 camera_ids[group] = len(camera_ids) + 1
-                _enter_camera(db, _first_guess(photo, camera_model, camera_params, camera_ids[group]))
+                sideways = turns.get(photo.image_name, 0) % 2
+                size = (photo.height, photo.width) if sideways else (photo.width, photo.height)
+                camera = _first_guess(size, photo.focal_px, camera_model, camera_params, camera_ids[group])
+                _enter_camera(db, camera)
             _enter_image(db, photo.image_name, camera_ids[group], image_id)
 
 
@@ -84,18 +109,19 @@ def _enter_image(db: pycolmap.Database, name: str, camera_id: int, image_id: int
     db.write_frame(frame, use_frame_id=True)
 
 
-def _first_guess(photo: Photo, model: str, params: Sequence[float] | None, camera_id: int) -> pycolmap.Camera:
-    """The camera of a photo: as it is known, by EXIF's focal length, or by a guess."""
-    size = photo.width, photo.height
+def _first_guess(
+    size: tuple[int, int], focal_px: float | None, model: str, params: Sequence[float] | None, camera_id: int
+) -> pycolmap.Camera:
+    """The camera of photos of this width and height: as it is known, by EXIF's focal length, or by a guess."""
     if params is not None:
         camera = pycolmap.Camera(camera_id=camera_id, model=model, width=size[0], height=size[1], params=list(params))
         camera.has_prior_focal_length = True
         return camera
     fisheye = model.endswith("FISHEYE")
     guess = fisheye_focal_px(*size) if fisheye else FOCAL_GUESS * max(size)
-    camera = pycolmap.Camera.create_from_model_name(camera_id, model, photo.focal_px or guess, *size)
+    camera = pycolmap.Camera.create_from_model_name(camera_id, model, focal_px or guess, *size)
     # Two views through a fisheye have no fundamental matrix to do without a focal length: the guess has to serve.
-    camera.has_prior_focal_length = fisheye or photo.focal_px is not None
+    camera.has_prior_focal_length = fisheye or focal_px is not None
     return camera
 
 
@@ -147,9 +173,10 @@ def extract_features(
     photos: Sequence[Photo],
     extraction: ExtractionOptions,
     on_few: Callable[[float], None] = lambda median: None,
+    turns: Turns = UPRIGHT,
 ) -> None:
     """SIFT keypoints and descriptors of every photo that has none yet, where ``masks/<image name>.png`` is not black,
-    or anywhere where that is not there.
+    or anywhere where that is not there. ``turns`` are those that the database was filled with.
 
     The scale space begins at the photos' own size. Doubling them first, as is COLMAP's habit, costs 4.5 times as
     much and moves no camera of a well-sized photo (benchmarks/sfm_accuracy.py), so only small ones are doubled. Where
@@ -163,15 +190,15 @@ def extract_features(
         some = [large[place] for place in spread(len(large), min(len(large), COUNTED_PHOTOS))]
         with tempfile.TemporaryDirectory(dir=database.parent) as folder:
             counted = Path(folder, "some.db")
-            fill_database(counted, [photos[number] for number in some], MAPPING_MODEL)
-            _extract(counted, images, [photos[number] for number in some], extraction)
+            fill_database(counted, [photos[number] for number in some], MAPPING_MODEL, turns=turns)
+            _extract(counted, images, [photos[number] for number in some], extraction, turns)
             yielded = _median_features(counted, len(some))
             if yielded < MIN_FEATURES_SHARE * extraction.max_features:
                 on_few(yielded)
                 extraction = extraction.larger()
             else:
                 _copy_features(counted, database, some)
-    _extract(database, images, [photos[number] for number in todo], extraction)
+    _extract(database, images, [photos[number] for number in todo], extraction, turns)
 
 
 def _median_features(database: Path, count: int) -> float:
@@ -197,15 +224,23 @@ Extracted = tuple[np.ndarray, pycolmap.FeatureDescriptors]
 """Keypoints and descriptors of a photo as COLMAP writes them."""
 
 
-def _extract(database: Path, images: Path, photos: Sequence[Photo], extraction: ExtractionOptions) -> None:
+def _extract(
+    database: Path, images: Path, photos: Sequence[Photo], extraction: ExtractionOptions, turns: Turns
+) -> None:
     """The features of these photos, whatever they yield. Those of photos that have some are left alone."""
-
-    def here(work: object, groups: object) -> Iterable[list[Extracted]]:
-        _extract_here(database, images, photos, extraction, at_once(processors(), feature_bytes(photos, extraction)))
-        return ()  # COLMAP has written them itself
-
     if not photos:
         return
+    threads = at_once(processors(), feature_bytes(photos, extraction))
+
+    def here(
+        work: Callable[[Sequence[Photo]], list[Extracted]], groups: Iterable[Sequence[Photo]]
+    ) -> Iterable[list[Extracted]]:
+        if not turns:
+            _extract_here(database, images, photos, extraction, threads)  # COLMAP writes them itself
+            return
+        with ThreadPoolExecutor(threads) as pool:
+            yield from pool.map(work, groups)
+
     with pycolmap.Database.open(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         todo = [photo for photo in photos if not db.exists_descriptors(ids[photo.image_name])]
@@ -214,8 +249,19 @@ def _extract(database: Path, images: Path, photos: Sequence[Photo], extraction: 
         for group, found in zip(groups, extracted, strict=False):
             with pycolmap.DatabaseTransaction(db):
                 for photo, (keypoints, descriptors) in zip(group, found, strict=True):
-                    db.write_keypoints(ids[photo.image_name], keypoints)
+                    places = on_sensor(keypoints, photo, turns.get(photo.image_name, 0))
+                    db.write_keypoints(ids[photo.image_name], places)
                     db.write_descriptors(ids[photo.image_name], descriptors)
+
+
+def on_sensor(keypoints: np.ndarray, photo: Photo, turns: int) -> np.ndarray:
+    """Keypoints (n, 6) of an upright photo, x, y and the affine shape by rows, where they were before so many turns."""
+    width, height = photo.width, photo.height
+    x, y, *shape = keypoints.T
+    for _ in range(turns):
+        x, y, shape = y, width - x, [shape[2], shape[3], -shape[0], -shape[1]]
+        width, height = height, width
+    return np.stack([x, y, *shape], axis=1)
 
 
 def _extract_apart(images: Path, extraction: ExtractionOptions, photos: Sequence[Photo]) -> list[Extracted]:

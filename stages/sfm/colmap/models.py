@@ -3,6 +3,7 @@
 import errno
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from jaxtyping import Float
 from stages.contract import StageError
 from stages.io.colmap_files import NO_POINT, read_model_files
 from stages.io.sparse_model import SparseImage, SparseModel
-from stages.sfm.colmap.cameras import native
+from stages.sfm.colmap.cameras import native, pixel_map, plain, turned_camera, turned_pose
 
 # At most, in COLMAP's binary files: a feature with its part of a track, a point, a photo with its name; and the rest.
 BYTES_PER_PLACE, BYTES_PER_POINT, BYTES_PER_IMAGE, FIXED_BYTES = 32, 51, 1024, 1 << 16
@@ -67,6 +68,30 @@ def world_from_camera(pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "3 4"]:
 def load_native(sparse: Path) -> pycolmap.Reconstruction:
     """A model that this program wrote, as COLMAP has it."""
     return pycolmap.Reconstruction(sparse)
+
+
+def turned_upright(model: pycolmap.Reconstruction, turns: Mapping[str, int]) -> pycolmap.Reconstruction:
+    """The model with these images (by name), their cameras and poses turned by so many quarter turns clockwise. Images
+    that were turned by different amounts get cameras of their own."""
+    new, camera_ids = pycolmap.Reconstruction(), dict[tuple[int, int], int]()
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.image(image_id)
+        before, by = plain(model.camera(image.camera_id)), turns.get(image.name, 0)
+        camera, key = turned_camera(before, by), (image.camera_id, by)
+        if key not in camera_ids:
+            camera_ids[key] = len(camera_ids) + 1
+            new.add_camera_with_trivial_rig(native(camera, camera_ids[key]))
+        places = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+        places = np.c_[places, np.ones(len(places))] @ pixel_map(before, by, camera.width, camera.height).T
+        points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in places])
+        entry = pycolmap.Image(name=image.name, camera_id=camera_ids[key], image_id=image_id, points2D=points2D)
+        pose = turned_pose(image.cam_from_world().inverse().matrix(), by)
+        new.add_image_with_trivial_frame(entry, pycolmap.Rigid3d(pose).inverse())
+    for point_id in sorted(model.point3D_ids()):
+        point = model.point3D(point_id)
+        new.add_point3D(point.xyz, point.track, point.color)
+    new.update_point_3d_errors()
+    return new
 
 
 def write_native(sparse: Path, model: pycolmap.Reconstruction) -> None:

@@ -10,10 +10,11 @@ from stages.contract import Note, StageError
 from stages.ingest.sources import own_registration
 from stages.io.photos import Photo
 from stages.io.sparse_model import SparseModel
+from stages.sfm.colmap.cameras import pixel_map
 from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.conventions import OF_COLMAP, SAME_POSE_WITHIN, PoseConvention, inverse, world_from_camera
 from stages.sfm.imported.imported_poses import ImportedPoses, few, notes_on_photos, nothing_matches
-from stages.sfm.imported.orientation import fits_only_upright, pixel_map
+from stages.sfm.imported.orientation import fits_only_upright
 from stages.sfm.imported.photo_names import other_spelling, photos_by_name
 from stages.sfm.imported.posed_photos import distinct, posed_photo, without_rays
 

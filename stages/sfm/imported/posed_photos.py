@@ -8,10 +8,19 @@ from jaxtyping import Float
 
 from nerf.geometry.scene import Camera
 from stages.contract import Note, StageError
+from stages.ingest.orientation import QUARTER_TURNS
 from stages.io.photos import Photo
 from stages.io.sparse_model import SparseImage
-from stages.sfm.colmap.cameras import native, no_ray, rescaled, share_without_ray, why_no_ray
-from stages.sfm.imported.orientation import QUARTER_TURNS, is_of_stored_pixels, same_shape, turned_camera, turned_pose
+from stages.sfm.colmap.cameras import (
+    native,
+    no_ray,
+    rescaled,
+    share_without_ray,
+    turned_camera,
+    turned_pose,
+    why_no_ray,
+)
+from stages.sfm.imported.orientation import is_of_stored_pixels, same_shape
 from stages.sfm.imported.transforms_intrinsics import why_unusable
 
 HINT = "Correct it and run again, or leave out the cameras to find them from the photos: pipeline run FOLDER"

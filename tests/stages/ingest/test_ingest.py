@@ -20,6 +20,7 @@ from stages.io.photos import read_frame_names, read_photos
 from stages.io.pixels import load_pixels
 from stages.io.video import video_writer
 from tests.blots import blots, cut_out
+from tests.stages.ingest.photo_files import exif_with
 
 
 def picture(seed: int, width: int = 32, height: int = 24) -> Image.Image:
@@ -153,6 +154,15 @@ def exif_of(make: str, model: str, lens: str = "") -> Image.Exif:
 def groups(folder: Path, out: Path, progress: Any) -> list[int]:
     ingest.run(Config(photos=folder), {}, out, progress)
     return [photo.camera_group for photo in read_photos(out)]
+
+
+def test_a_phone_held_in_any_way_is_one_camera(tmp_path: Path, progress: Any) -> None:
+    for orientation in range(1, 9):
+        picture(orientation).save(tmp_path / f"{orientation}.jpg", exif=exif_with(orientation, Make="A", Model="1"))
+    mirrored = [2, 4, 5, 7]  # no camera takes such photos
+    found = groups(tmp_path, tmp_path / "out", progress)
+    assert {found[orientation - 1] for orientation in (1, 3, 6, 8)} == {0}
+    assert len({found[orientation - 1] for orientation in mirrored}) == len(mirrored) and 0 not in found[1:2]
 
 
 def test_two_phones_in_one_folder_are_two_cameras(tmp_path: Path, progress: Any) -> None:

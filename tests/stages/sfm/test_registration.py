@@ -35,6 +35,7 @@ def matches(
     return Matches(
         keypoints=np.full(len(NAMES), keypoints),
         tried=len(NAMES) * (len(NAMES) - 1) // 2,
+        sizes=np.tile([640, 480], (len(NAMES), 1)),
         pairs=array,
         planar=np.arange(len(array)) < planar,
         homography=np.tile(np.eye(3) if turned else np.diag([2.0, 1.0, 1.0]), (len(array), 1, 1)),

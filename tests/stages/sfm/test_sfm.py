@@ -17,15 +17,19 @@ from nerf.geometry.alignment import align
 from pipeline.engine.display import SilentDisplay
 from stages import ingest, sfm
 from stages.contract import run_stage
+from stages.ingest.orientation import QUARTER_TURNS
 from stages.io.files import read_json, write_png
 from stages.io.photos import read_photos, write_photos
+from stages.io.pixels import load_pixels
 from stages.sfm import worker_process
+from stages.sfm.colmap.cameras import turned_pose
 from stages.sfm.colmap.models import read_model
 from stages.sfm.registration import count_done
 from stages.sfm.retry_strategies import STRATEGIES, Outcome, StrategyLog
 from tests.blots import blots
 from tests.refusals import refused
 from tests.small_scenes import write_blender_scene
+from tests.stages.ingest.photo_files import exif_with
 from tests.stages.sfm.sfm_inputs import SMALL, ingested
 from tests.synthetic_photos import SyntheticPhotos
 
@@ -63,6 +67,40 @@ def test_cameras_of_synthetic_photos_are_found(reconstructed: Path, synthetic_ph
     assert 0 < np.linalg.norm(aligned[:, :, 3] - true[:, :, 3], axis=1).max() < 0.015  # 3 from the table
     cosines = (np.einsum("nij,nij->n", aligned[:, :, :3], true[:, :, :3]) - 1) / 2
     assert 0 < np.degrees(np.arccos(cosines)).max() < 1
+
+
+def test_a_camera_held_in_several_ways_is_one(synthetic_photos: SyntheticPhotos, tmp_path: Path) -> None:
+    orientations = dict(zip(sorted(synthetic_photos.truth.poses), [1, 6, 1, 8, 1, 1, 3, 1, 6, 1, 1, 1], strict=True))
+    (tmp_path / "photos").mkdir()
+    for name, orientation in orientations.items():
+        with Image.open(synthetic_photos.folder / name) as stored:
+            exif = exif_with(orientation, Make="A", Model="1")
+            stored.save(tmp_path / "photos" / name, quality=98, subsampling=0, exif=exif)
+    found = {"ingest": tmp_path / "ingest", "sfm": tmp_path / "sfm"}
+    for folder in found.values():
+        folder.mkdir()
+    ingest.run(ingest.Config(photos=tmp_path / "photos"), {}, found["ingest"], SilentDisplay())
+    run_stage(sfm, SMALL, found, found["sfm"], SilentDisplay())
+    model = read_model(found["sfm"] / "sparse")
+    assert [image.file for image in model.images] == sorted(orientations), "all are registered"
+    assert len({camera.model for camera in model.cameras}) == 1
+    focal = [camera.params[0] for camera in model.cameras]
+    assert len(focal) == 4 and focal == pytest.approx([focal[0]] * 4, rel=1e-9), "one lens"
+    truth = synthetic_photos.truth.poses
+    true = np.stack([turned_pose(truth[name], QUARTER_TURNS[turned]) for name, turned in orientations.items()])
+    poses = np.stack([image.sfm_from_camera for image in model.images])
+    truth_from_sfm = align(poses[:, :, 3], true[:, :, 3])
+    aligned = np.stack([truth_from_sfm.pose(pose) for pose in poses])
+    assert np.linalg.norm(aligned[:, :, 3] - true[:, :, 3], axis=1).max() < 0.015
+    cosines = (np.einsum("nij,nij->n", aligned[:, :, :3], true[:, :, :3]) - 1) / 2
+    assert np.degrees(np.arccos(cosines)).max() < 1
+    photos = {photo.file.removeprefix("images/"): photo for photo in read_photos(found["ingest"])}
+    for index, image in enumerate(model.images):  # colours are those of the upright photos
+        photo, mine = photos[image.file], model.view == index
+        pixels = load_pixels(found["ingest"] / photo.file, photo.width, photo.height)
+        column, row = np.floor(model.xy[mine]).astype(int).clip(0, [photo.width - 1, photo.height - 1]).T
+        off = np.abs(pixels[row, column].astype(float) - model.rgb[model.point[mine]]).mean()
+        assert off < 25, image.file
 
 
 def test_the_account_says_what_became_of_each_photo(reconstructed: Path) -> None:

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from threading import get_ident
 
@@ -11,8 +12,11 @@ import pytest
 from PIL import Image
 
 import stages.sfm.colmap.database as database_module
+from nerf.geometry.scene import Camera
 from stages.hardware import cluster
+from stages.ingest.orientation import QUARTER_TURNS, turned_size, upright
 from stages.io.photos import Photo
+from stages.sfm.colmap.cameras import pixel_map
 from stages.sfm.colmap.database import (
     ExtractionOptions,
     Features,
@@ -21,6 +25,8 @@ from stages.sfm.colmap.database import (
     image_similarity,
     keep_open,
     match_pairs,
+    on_sensor,
+    turns_of_cameras,
     verify_again,
 )
 from stages.sfm.colmap.diagnosis import links
@@ -342,3 +348,65 @@ def test_extraction_that_was_interrupted_goes_on(tmp_path: Path) -> None:
     done, other = features_of(tmp_path, photos, "again")
     assert len(done) == 3
     np.testing.assert_array_equal(other, whole[1])
+
+
+HELD = {"landscape": 1, "portrait": 6, "upside-down": 3, "other-portrait": 8}
+
+
+def held(photo: Photo, orientation: int) -> Photo:
+    """The photo after its camera was turned."""
+    width, height = turned_size((photo.width, photo.height), orientation)
+    return replace(photo, width=width, height=height, orientation=orientation)
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_keypoints_go_back_to_where_the_sensor_has_them(orientation: int) -> None:
+    random, turns = np.random.default_rng(0), QUARTER_TURNS[orientation]
+    photo = held(Photo("a", "images/a", 60, 40, 0, None, None, False, 1.0), orientation)
+    stored = np.concatenate([random.uniform(0, 40, (9, 2)), random.normal(size=(9, 4))], axis=1)
+    turn = pixel_map(Camera("SIMPLE_PINHOLE", 60, 40, (50.0, 30.0, 20.0)), turns, photo.width, photo.height)
+    upright = stored.copy()
+    upright[:, :2] = stored[:, :2] @ turn[:, :2].T + turn[:, 2]
+    upright[:, 2:] = (turn[:, :2] @ stored[:, 2:].reshape(-1, 2, 2)).reshape(-1, 4)
+    np.testing.assert_allclose(on_sensor(upright, photo, turns), stored, atol=1e-12)
+
+
+@pytest.mark.parametrize("on_cluster", [False, True])
+def test_features_of_a_turned_photo_are_those_of_its_sensor(
+    on_cluster: bool, tmp_path: Path, ray_cluster: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(database_module, "COUNTED_PHOTOS", 1)
+    photos = pictures(tmp_path, 4, 0)
+    stored = features_of(tmp_path, photos, "stored")
+    photos = [held(photo, orientation) for photo, orientation in zip(photos, HELD.values(), strict=True)]
+    for photo in photos:
+        with Image.open(tmp_path / photo.name) as picture:
+            turned = upright(picture.copy(), photo.orientation)
+        turned.save(tmp_path / photo.name)
+    database, turns = tmp_path / "turned.db", turns_of_cameras(photos)
+    assert list(turns.values()) == [1, 2, 3]
+    fill_database(database, photos, "SIMPLE_RADIAL", turns=turns)
+    with cluster.joined(ray_cluster if on_cluster else None):
+        extract_features(database, tmp_path, photos, ASKED, turns=turns)
+    with pycolmap.Database.open(database) as db:
+        (camera,) = db.read_all_cameras()
+        assert (camera.width, camera.height) == (480, 360)
+        for number, here in enumerate(stored, 1):
+            there = np.array(db.read_keypoints(number), float).reshape(-1, 6)
+            nearest = np.linalg.norm(there[:, None, :2] - here[:, :2], axis=2).min(axis=0)
+            assert np.median(nearest) < 0.05 and (nearest < 0.5).mean() > 0.85  # the weakest are others
+            assert db.num_descriptors_for_image(number) == len(there)
+
+
+def test_upright_photos_of_a_turned_camera_have_their_own(tmp_path: Path) -> None:
+    photos = [
+        held(photo, orientation) for photo, orientation in zip(pictures(tmp_path, 4, 0), (1, 1, 6, 6), strict=True)
+    ]
+    fill_database(tmp_path / "upright.db", photos, "SIMPLE_RADIAL")
+    with pycolmap.Database.open(tmp_path / "upright.db") as db:
+        assert sorted((camera.width, camera.height) for camera in db.read_all_cameras()) == [(360, 480), (480, 360)]
+        assert len({db.read_image(number).camera_id for number in (1, 2)}) == 1
+
+
+def test_photos_that_are_all_held_alike_stay_upright(tmp_path: Path) -> None:
+    assert turns_of_cameras([held(photo, 6) for photo in pictures(tmp_path, 3, 0)]) == {}

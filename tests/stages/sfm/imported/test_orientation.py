@@ -13,15 +13,15 @@ from PIL import Image
 from nerf.geometry.scene import Camera
 from stages import ingest, normalise, sfm
 from stages.contract import run_stage
-from stages.ingest.orientation import upright
+from stages.ingest.orientation import QUARTER_TURNS, upright
 from stages.io.colmap_files import PARAMETERS
 from stages.io.photos import Photo, read_photos
 from stages.io.pixels import load_pixels
 from stages.io.sparse_model import SparseImage, SparseModel
-from stages.sfm.colmap.cameras import camera_rays, project
+from stages.sfm.colmap.cameras import camera_rays, pixel_map, project, turned_camera, turned_pose
 from stages.sfm.colmap.models import read_model, write_model
 from stages.sfm.imported.imported_poses import ImportedPoses
-from stages.sfm.imported.orientation import QUARTER_TURNS, pixel_map, same_shape, turned_camera, turned_pose
+from stages.sfm.imported.orientation import same_shape
 from stages.sfm.imported.pose_files import read_poses
 from tests.camera_layouts import ring
 from tests.refusals import codes, refused
