@@ -6,13 +6,15 @@ along its normal and the agreement is measured at each offset: the mean zero-mea
 pairs of photos, which exposure does not matter to (multi-view stereo on a mesh: Furukawa and Ponce 2010; Vu et al.
 2012). All offsets o, in voxels, are then found together. They minimise
 
-    Σ w (o − ô)² + Σ p o² + SMOOTHNESS Σ over edges (o_i − o_j)² + FAIRNESS Σ s |curvature|²
+    Σ w (o − ô)² + Σ p o² + SMOOTHNESS Σ over edges (o_i − o_j)² + FAIRNESS Σ s e |curvature|²
 
 with ô the offset of best agreement and w what it is worth: the curvature of the agreement there, by its height. p is
 PRIOR where two photos show a vertex and UNSEEN elsewhere: a bare wall follows its neighbours, and what no photo sees
 stays. Curvature is that of the moved surface (its umbrella vector, along the normals), and counts where photos tell
-about the surface, s: elsewhere it would shrink what is thin. Photos that show a silhouette next to a vertex take no
-part there: its patch would be one half of what moves behind it. Constants: docs/experiments/mesh.md.
+about the surface, s: elsewhere it would shrink what is thin. The umbrella of edges of length h is h² / 4 of the
+curvature, and a vertex stands for an area of h²: e = (FAIR_EDGE / h)⁴ makes a surface as smooth whatever the length of
+its edges, within EDGES. Photos that show a silhouette next to a vertex take no part there: its patch would be one half
+of what moves behind it. Constants: docs/experiments/mesh.md.
 """
 
 from collections.abc import Callable
@@ -38,6 +40,7 @@ NOISE = 1.0  # deviation of a pixel, of 255, in a patch
 MAX_PICTURE_BYTES = 1 << 29  # of all photos; where these are more, they are smaller
 CHUNK = 1 << 10  # vertices at a time: what fits into a processor's cache
 PRIOR, UNSEEN, SMOOTHNESS, FAIRNESS = 0.01, 0.3, 0.1, 1.0
+FAIR_EDGE, EDGES = 1.5, (0.5, 2.0)  # voxels
 SUPPORTED = 0.3  # what an offset is worth from where on curvature counts in full
 TOLERANCE, MAX_ITERATIONS = 1e-4, 300
 UNTURNED_STEPS = 3
@@ -301,7 +304,8 @@ def _balanced(
     linked = csr_array((np.ones(means.nnz), means.indices, means.indptr), (count, count))  # with themselves
     degree = np.diff(means.indptr) - 1.0
     umbrella = eye_array(count) - diags_array(1 / np.maximum(degree, 1)) @ (linked - eye_array(count))
-    support = diags_array(np.clip(means @ worth / SUPPORTED, 0, 1))
+    edge = (_edge_lengths(surface, means) / patches.across).clip(*EDGES)
+    support = diags_array(np.clip(means @ worth / SUPPORTED, 0, 1) * (FAIR_EDGE / edge) ** 4)
     # Lengths are in voxels of the vertex in the middle; offsets move the others by their own.
     own = diags_array(1 / patches.normal) @ umbrella
     pull = (diags_array(patches.normal) @ own.T @ support @ own).tocsr()
@@ -314,6 +318,14 @@ def _balanced(
     smooth = SMOOTHNESS * (diags_array(degree + 1) - linked)
     system = (fair + smooth + diags_array(worth + stay)).tocsr()
     return cg(system, worth * offset - known, rtol=TOLERANCE, maxiter=MAX_ITERATIONS)[0]
+
+
+def _edge_lengths(surface: Surface, means: csr_array) -> np.ndarray:
+    """Of the edges at each vertex, the root of the mean square, (n,)."""
+    count = np.diff(means.indptr)  # with the vertex itself
+    vertex = np.repeat(np.arange(len(count)), count)
+    square = ((surface.vertices[vertex] - surface.vertices[means.indices]) ** 2).sum(axis=1)
+    return np.sqrt(np.bincount(vertex, square, len(count)) / np.maximum(count - 1, 1))
 
 
 def _unturned(surface: Surface, shifted: np.ndarray) -> np.ndarray:

@@ -1,21 +1,13 @@
 """Surfaces beside their place, moved to where photos of them agree."""
 
-import math
-
 import numpy as np
 import pytest
 
-from nerf.geometry.camera_paths import look_at
-from nerf.geometry.scene import Camera, Scene, Similarity, View
-from stages.io.files import write_png
-from stages.io.photos import Photo, write_photos
-from stages.mesh.grid_space import VoxelLengths
 from stages.mesh.photos.refinement import refine
 from stages.mesh.photos.sightings import find_sightings
-from stages.mesh.surface import Surface
+from tests.stages.mesh.plane_photos import known, ring_of_views, scene_of, sheet, square_camera, write_plane_photos
 
-SIDE, FOCAL, VOXEL = 200, 250.0, 0.04
-CAMERA = Camera("PINHOLE", SIDE, SIDE, (FOCAL, FOCAL, SIDE / 2, SIDE / 2))
+CAMERA, VOXEL, CELLS = square_camera(200), 0.04, 40
 
 
 def pattern(points):
@@ -23,16 +15,6 @@ def pattern(points):
     x, y = points[:, 0], points[:, 1]
     waves = np.sin(23 * x + 3 * np.sin(9 * y)) + np.sin(31 * y + 2 * np.sin(13 * x)) + np.sin(17 * (x - y))
     return 0.5 + 0.12 * np.where(x > 0, waves, 0)
-
-
-def sheet(height, cells=40, half=0.8):
-    """The square [-half, half]² seen from above, each vertex at ``height`` (x, y)."""
-    line = np.linspace(-half, half, cells + 1)
-    x, y = (part.reshape(-1) for part in np.meshgrid(line, line, indexing="ij"))
-    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
-    a, b, c, d = (part.reshape(-1) for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
-    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    return Surface(np.stack([x, y, height(x, y)], axis=1), faces.astype(np.int32))
 
 
 def wavy(x, y):
@@ -45,24 +27,13 @@ def refined(tmp_path):
     """Refine a surface with photos of the textured plane z = 0; ``change(number, grey, points)`` alters one."""
 
     def run(surface, change=lambda number, grey, points: grey, count=7):
-        views, photos = [], []
-        for number in range(count):
-            angle = 2 * math.pi * number / count
-            centre = np.array([0.7 * math.cos(angle), 0.7 * math.sin(angle), 2.2])
-            pose = look_at(centre[None], np.zeros(3), np.array([0.0, 1, 0]))[0]
-            at = (np.arange(SIDE) + 0.5 - SIDE / 2) / FOCAL
-            x, y = np.meshgrid(at, at)
-            rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ pose[:, :3].T
-            points = pose[:, 3] - rays * (pose[2, 3] / rays[:, 2:])
-            grey = np.clip(change(number, pattern(points), points), 0, 1).reshape(SIDE, SIDE, 1)
-            name = f"{number}.png"
-            write_png(tmp_path / "images" / name, np.rint(255 * grey).astype(np.uint8).repeat(3, axis=2))
-            views.append(View(name, f"images/{name}", 0, pose, 0.1, 9.0, "train"))
-            photos.append(Photo(name, f"images/{name}", SIDE, SIDE, 0, None, None, False, 1.0))
-        write_photos(tmp_path, photos, [], {})
-        identity = Similarity(1.0, np.eye(3), np.zeros(3))
-        scene = Scene((CAMERA,), tuple(views), identity, True, False, "forward-facing", True)
-        voxels = VoxelLengths(*2 * [np.full(len(surface.vertices), VOXEL)])
+        views = ring_of_views(count, 0.7, 2.2)
+
+        def colours(number, points):
+            return change(number, pattern(points), points)[:, None].repeat(3, axis=1)
+
+        write_plane_photos(tmp_path, CAMERA, views, colours)
+        voxels, scene = known(surface, VOXEL), scene_of(CAMERA, views)
         sightings = find_sightings(surface, scene, tmp_path, {"effects": {}}, voxels, lambda done: None)
         return refine(surface, sightings, voxels, lambda done: None)
 
@@ -81,7 +52,7 @@ def textured(surface):
 
 
 def test_a_wavy_surface_is_moved_onto_the_plane(refined):
-    surface = sheet(wavy)
+    surface = sheet(CELLS, wavy)
     found = refined(surface)
     assert found is not None and found.kept and 0 < found.before < found.after
     assert height_error(surface, textured(surface)) > 0.5
@@ -89,22 +60,39 @@ def test_a_wavy_surface_is_moved_onto_the_plane(refined):
     assert np.array_equal(found.surface.faces, surface.faces)
 
 
+def test_short_edges_are_as_smooth_as_long_ones(refined):
+    def noisy(number, grey, points):
+        return grey + np.random.default_rng(number).normal(0, 0.03, grey.shape)
+
+    def bent(cells):
+        """Mean angle (degrees) of faces to the plane, where there is texture and photos enough."""
+        surface = refined(sheet(cells, wavy), noisy).surface
+        corners = surface.vertices[surface.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        middle = corners.mean(axis=1)
+        inner = (np.abs(middle[:, :2]) < 0.6).all(axis=1) & (middle[:, 0] > 0.1)
+        return np.degrees(np.arccos(normals[inner, 2] / np.linalg.norm(normals[inner], axis=1))).mean()
+
+    found = [bent(20), bent(40), bent(60)]
+    assert max(found[1:]) < 1.3 * found[0]
+
+
 def test_exposures_do_not_matter(refined):
     gains = [1.0, 0.6, 1.3, 0.8, 1.1, 0.7, 1.0]
-    surface = sheet(wavy)
+    surface = sheet(CELLS, wavy)
     found = refined(surface, lambda number, grey, _: gains[number] * grey)
     assert found is not None and 0 < height_error(found.surface, textured(surface)) < 0.06
 
 
 def test_a_surface_in_its_place_stays(refined):
-    surface = sheet(lambda x, y: 0 * x)
+    surface = sheet(CELLS)
     found = refined(surface)
     assert found is not None and height_error(found.surface, textured(surface)) < 0.03
 
 
 def test_a_bare_wall_makes_nothing_up(refined):
     """It follows its neighbours, and comes no farther from its place than it was."""
-    surface = sheet(wavy)
+    surface = sheet(CELLS, wavy)
     bare = (surface.vertices[:, 0] < -0.2) & (np.abs(surface.vertices[:, 1]) < 0.6)
     found = refined(surface)
     assert found is not None and height_error(found.surface, bare) < 1.1 * height_error(surface, bare)
@@ -112,7 +100,7 @@ def test_a_bare_wall_makes_nothing_up(refined):
 
 def test_photos_that_agree_nowhere_move_nothing_far(refined):
     random = np.random.default_rng(0)
-    surface = sheet(wavy)
+    surface = sheet(CELLS, wavy)
     found = refined(surface, lambda number, grey, points: random.random(len(grey)))
     assert found is not None
     moved = np.linalg.norm(found.surface.vertices - surface.vertices, axis=1) / VOXEL
@@ -120,8 +108,8 @@ def test_photos_that_agree_nowhere_move_nothing_far(refined):
 
 
 def test_what_no_two_photos_show_is_left(refined):
-    assert refined(sheet(wavy), count=1) is None
-    surface = sheet(wavy)
+    assert refined(sheet(CELLS, wavy), count=1) is None
+    surface = sheet(CELLS, wavy)
     turned = from_below(surface)
     assert refined(turned) is None
 
@@ -132,6 +120,6 @@ def from_below(surface):
 
 
 def test_the_same_bytes_each_time(refined):
-    first, second = refined(sheet(wavy)), refined(sheet(wavy))
+    first, second = refined(sheet(CELLS, wavy)), refined(sheet(CELLS, wavy))
     assert first is not None and second is not None
     assert first.surface.vertices.tobytes() == second.surface.vertices.tobytes()

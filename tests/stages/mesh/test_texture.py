@@ -13,12 +13,8 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from nerf.effects.exposure import expose
-from nerf.geometry.camera_paths import look_at
-from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages.io.files import write_png
-from stages.io.photos import Photo, write_photos
 from stages.mesh.files import ColouredMesh, glb_bytes, obj_files
-from stages.mesh.grid_space import VoxelLengths
 from stages.mesh.photos.photo import sampled_picture
 from stages.mesh.photos.sightings import find_sightings
 from stages.mesh.rasteriser import barycentric, covered_pixels
@@ -28,10 +24,10 @@ from stages.mesh.texture.baking import fill_gutters
 from stages.mesh.texture.charts import cut_into_charts
 from stages.mesh.texture.texturing import texture_of
 from tests.refusals import refused
+from tests.stages.mesh.plane_photos import known, ring_of_views, scene_of, sheet, square_camera, write_plane_photos
 
-SIDE, FOCAL = 160, 200.0
-CAMERA = Camera("PINHOLE", SIDE, SIDE, (FOCAL, FOCAL, SIDE / 2, SIDE / 2))
-GREY = 128
+SIDE, GREY, VOXEL, CELLS = 160, 128, 0.05, 16
+CAMERA = square_camera(SIDE)
 
 
 def pattern(points):
@@ -41,41 +37,7 @@ def pattern(points):
     return 0.5 + 0.15 * waves + 0.15 * np.stack([x, y, -x], axis=1)
 
 
-def known(surface):
-    """How well it is known everywhere."""
-    return VoxelLengths(*2 * [np.full(len(surface.vertices), 0.05)])
-
-
-def sheet(cells=16, half=0.8):
-    """The square [-half, half]² at z = 0, seen from above."""
-    line = np.linspace(-half, half, cells + 1)
-    x, y = np.meshgrid(line, line, indexing="ij")
-    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
-    a, b, c, d = (part.reshape(-1) for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
-    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    return Surface(np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3), faces.astype(np.int32))
-
-
-def views(count=6):
-    poses = []
-    for number in range(count):
-        angle = 2 * math.pi * number / count
-        centre = np.array([0.5 * math.cos(angle), 0.5 * math.sin(angle), 2.0])
-        poses.append(look_at(centre[None], np.zeros(3), np.array([0.0, 1, 0]))[0])
-    return tuple(View(f"{i}.png", f"images/{i}.png", 0, pose, 0.1, 9.0, "train") for i, pose in enumerate(poses))
-
-
-def scene_of(some):
-    return Scene((CAMERA,), some, Similarity(1.0, np.eye(3), np.zeros(3)), True, False, "forward-facing", True)
-
-
-def seen_points(view):
-    """Where the rays of a photo meet the plane z = 0, (pixels, 3)."""
-    at = (np.arange(SIDE) + 0.5 - SIDE / 2) / FOCAL
-    x, y = np.meshgrid(at, at)
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ view.scene_from_camera[:, :3].T
-    centre = view.scene_from_camera[:, 3]
-    return centre - rays * (centre[2] / rays[:, 2:])
+VIEWS = ring_of_views(6, 0.5, 2.0)
 
 
 @pytest.fixture
@@ -83,18 +45,12 @@ def shoot(tmp_path):
     """Write photos of the plane: ``change(index, colours, points)`` may alter what one shows; the scene of them."""
 
     def write(change=lambda index, colours, points: colours, some=None, masks=(), alpha=None):
-        taken, photos = some or views(), []
-        for index, view in enumerate(taken):
-            points = seen_points(view)
-            colours = change(index, pattern(points), points)
-            pixels = np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8).reshape(SIDE, SIDE, 3)
-            write_png(tmp_path / view.file, pixels if alpha is None else np.dstack([pixels, alpha]))
-            photos.append(Photo(view.name, view.file, SIDE, SIDE, 0, None, None, False, 1.0))
+        taken = some or VIEWS
+        write_plane_photos(tmp_path, CAMERA, taken, lambda index, points: change(index, pattern(points), points), alpha)
         for index, mask in masks:
             write_png(tmp_path / f"masks/{index}.png", mask)
             taken = (*taken[:index], replace(taken[index], mask=f"masks/{index}.png"), *taken[index + 1 :])
-        write_photos(tmp_path, photos, [], {})
-        return scene_of(taken)
+        return scene_of(CAMERA, taken)
 
     return write
 
@@ -106,7 +62,7 @@ def baked(tmp_path):
     def bake(surface, scene, effects=None, size=512):
         grey = np.full((len(surface.vertices), 3), GREY, np.uint8)
         field = {"effects": effects or {}}
-        seen = find_sightings(surface, scene, tmp_path, field, known(surface), lambda done: None)
+        seen = find_sightings(surface, scene, tmp_path, field, known(surface, VOXEL), lambda done: None)
         found = texture_of(surface, grey, seen, size, lambda what, done: None)
         assert found is not None
         atlas, picture = found.texture
@@ -127,7 +83,7 @@ def error(points, colours, expected=None):
 
 
 def test_the_texture_shows_what_the_photos_show(shoot, baked):
-    points, colours, found = baked(sheet(), shoot())
+    points, colours, found = baked(sheet(CELLS), shoot())
     assert 0 < error(points, colours) < 0.015
     assert 0.8 < found.texture.atlas.texels_per_pixel <= 1 and found.outliers < 0.01
     coarse = np.full_like(colours, 0.5)
@@ -138,10 +94,10 @@ def test_exposure_is_undone_before_photos_are_blended(shoot, baked):
     gains = [0.0, -0.9, 0.0, -0.8, 0.1, -0.9]
     taken = shoot(lambda index, colours, _: expose(torch.tensor(colours), torch.full((1, 3), gains[index])).numpy())
     learnt = {"exposure": {f"{index}.png": [gain] * 3 for index, gain in enumerate(gains)}}
-    points, colours, _ = baked(sheet(), taken, learnt)
+    points, colours, _ = baked(sheet(CELLS), taken, learnt)
     reference = torch.full((1, 3), sorted(gains)[2])  # torch's median of an even number is the lower one
     assert 0 < error(points, colours, expose(torch.tensor(pattern(points)), reference).numpy()) < 0.015
-    points, colours, _ = baked(sheet(), taken)
+    points, colours, _ = baked(sheet(CELLS), taken)
     assert error(points, colours, expose(torch.tensor(pattern(points)), reference).numpy()) > 0.02
 
 
@@ -150,11 +106,11 @@ def test_a_passer_by_leaves_no_ghost(shoot, baked):
         there = np.linalg.norm(points[:, :2] - [0.1, 0.1], axis=1) < 0.25
         return np.where((index == 2) & there[:, None], [0.9, 0.05, 0.9], colours)
 
-    points, colours, found = baked(sheet(), shoot(blocked))
+    points, colours, found = baked(sheet(CELLS), shoot(blocked))
     near = np.linalg.norm(points[:, :2] - [0.1, 0.1], axis=1) < 0.3
     wrong = np.abs(colours - pattern(points)).max(axis=1)[near] > 0.2
     assert found.outliers > 0.01 and wrong.mean() < 0.01
-    clean = baked(sheet(), shoot())
+    clean = baked(sheet(CELLS), shoot())
     assert error(points, colours) < error(*clean[:2]) + 0.005
 
 
@@ -168,10 +124,10 @@ def test_masked_pixels_are_never_used(shoot, baked):
         left = np.tile(np.arange(SIDE) < SIDE // 2, SIDE)
         return np.where(left[:, None], magenta, colours)
 
-    _, colours, found = baked(sheet(), shoot(left_is_magenta, views(1), [(0, mask)]))
+    _, colours, found = baked(sheet(CELLS), shoot(left_is_magenta, VIEWS[:1], [(0, mask)]))
     assert 0.3 < found.unseen < 0.7
     assert (np.abs(colours - magenta).max(axis=1) > 0.2).all()
-    unmasked = baked(sheet(), shoot(left_is_magenta, views(1)))[1]
+    unmasked = baked(sheet(CELLS), shoot(left_is_magenta, VIEWS[:1]))[1]
     assert (np.abs(unmasked - magenta).max(axis=1) < 0.1).mean() > 0.2
 
 
@@ -185,8 +141,8 @@ def test_alpha_counts_where_it_says_what_is_background(has_alpha, unseen, shoot,
         left = np.tile(np.arange(SIDE) < SIDE // 2, SIDE)
         return np.where(left[:, None] & has_alpha, [1.0, 0, 1], colours)
 
-    taken = replace(shoot(left_is_magenta, views(1), alpha=matte), has_alpha=has_alpha)
-    _, colours, found = baked(sheet(), taken)
+    taken = replace(shoot(left_is_magenta, VIEWS[:1], alpha=matte), has_alpha=has_alpha)
+    _, colours, found = baked(sheet(CELLS), taken)
     assert found.unseen == pytest.approx(unseen, abs=0.2)
     assert (np.abs(colours - [1.0, 0, 1]).max(axis=1) > 0.2).all()
 
@@ -195,20 +151,20 @@ def test_saturated_surfaces_have_as_many_texels(shoot, baked):
     def red(_, colours, points):
         return np.column_stack([np.ones(len(points)), colours[:, 1:]])
 
-    _, _, plain = baked(sheet(), shoot())
-    _, _, saturated = baked(sheet(), shoot(red))
+    _, _, plain = baked(sheet(CELLS), shoot())
+    _, _, saturated = baked(sheet(CELLS), shoot(red))
     assert saturated.texture.atlas.width > 0.9 * plain.texture.atlas.width
 
 
 def test_what_lies_behind_gets_nothing_of_what_hides_it(shoot, baked):
     """A red plate above the sheet; photos from all sides see what each other cannot."""
-    plate = sheet(4, 0.15)
+    plate = sheet(4, half=0.15)
     plate = Surface(plate.vertices + np.array([0, 0, 0.5]), plate.faces)
     both = Surface(
-        np.concatenate([sheet().vertices, plate.vertices]),
-        np.concatenate([sheet().faces, plate.faces + len(sheet().vertices)]),
+        np.concatenate([sheet(CELLS).vertices, plate.vertices]),
+        np.concatenate([sheet(CELLS).faces, plate.faces + len(sheet(CELLS).vertices)]),
     )
-    taken = views()
+    taken = VIEWS
 
     def with_plate(index, colours, points):
         centre = taken[index].scene_from_camera[:, 3]
@@ -286,13 +242,13 @@ def test_a_photo_that_is_gone_is_named(shoot, baked, tmp_path):
     scene = shoot()
     (tmp_path / "images/3.png").unlink()
     with refused("mesh.photo-unreadable", "3.png"):
-        baked(sheet(), scene)
+        baked(sheet(CELLS), scene)
 
 
 def test_a_surface_that_no_photo_sees_has_no_texture(shoot, tmp_path):
-    turned = sheet()._replace(faces=sheet().faces[:, ::-1])
+    turned = sheet(CELLS)._replace(faces=sheet(CELLS).faces[:, ::-1])
     grey = np.full((len(turned.vertices), 3), GREY, np.uint8)
-    seen = find_sightings(turned, shoot(), tmp_path, {"effects": {}}, known(turned), lambda done: None)
+    seen = find_sightings(turned, shoot(), tmp_path, {"effects": {}}, known(turned, VOXEL), lambda done: None)
     found = texture_of(turned, grey, seen, 64, lambda what, done: None)
     assert found is None
 
