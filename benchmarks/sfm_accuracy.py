@@ -6,7 +6,7 @@ DATA holds a folder per set: photos, and reference_cameras.json with K (px), wor
 camera_center_m for each. Printed are the mean and largest distance of the camera centres after the similarity that
 fits them best, and the mean angle between the rotations, beside the seconds that sfm took.
 
-With --turned every so manyth photo is as if it had been held upright: its file says so in EXIF, its pixels stay. What
+With --turned N every Nth photo is as if it had been held upright: its file says so in EXIF, its pixels stay. What
 is measured there knows nothing of EXIF, and so cameras are turned back for it.
 
 A set with a transforms.json instead, and photos in images/, has no truth but the cameras of another program: how far
@@ -66,7 +66,7 @@ def errors(
 
 
 def write_turned(photos: Path, folder: Path, every: int) -> None:
-    """Copy JPEGs of landscape photos; every so manyth says that it was held upright."""
+    """Copy JPEGs of landscape photos; every nth says that it was held upright."""
     folder.mkdir()
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = UPRIGHT_HELD

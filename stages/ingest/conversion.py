@@ -90,8 +90,8 @@ class _Taken:
 
     @property
     def camera(self) -> tuple[CameraKey, str]:
-        """Photos of equal ``camera`` share intrinsics. Where EXIF does not say which camera it was, the folder is all
-        that tells."""
+        """Photos of equal ``camera`` share intrinsics, turned with them. Where EXIF does not say which camera it was,
+        the folder is all that tells."""
         known = self.camera_key.make or self.camera_key.model or self.camera_key.lens
         return self.camera_key.sensor(), "" if known else str(Path(self.name).parent)
 
@@ -322,7 +322,8 @@ def store(converted: Converted, folder: Path) -> list[Photo]:
     files = ascii_files([(photo.name, photo.suffix) for photo in taken])
     index_of = {camera: index for index, camera in enumerate(dict.fromkeys(photo.camera for photo in taken))}
     groups = [index_of[photo.camera] for photo in taken]
-    relative = relative_sharpness([photo.sharpness for photo in taken], groups)
+    alike = [(group, photo.camera_key.width) for group, photo in zip(groups, taken, strict=True)]
+    relative = relative_sharpness([photo.sharpness for photo in taken], alike)
     photos: list[Photo] = []
     for index, (photo, file) in enumerate(zip(taken, files, strict=True)):
         _move(photo.waiting, folder / "images" / file)

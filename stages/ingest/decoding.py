@@ -101,8 +101,7 @@ def decode(path: Path) -> Decoded:
     """Decode one image file. Raises DecodeError with the reason if that cannot be done."""
     with _open(path) as image:
         stored_plainly, lossy = _is_plain(image), _is_lossy(image, path)
-        # Pillow turns TIFFs while it loads them, and forgets how.
-        turned = read_exif(image, [])[1] if image.format == "TIFF" else None
+        turned = _undone_orientation(image)
         _load(image)
         return _convert(image, stored_plainly, lossy, turned)
 
@@ -147,10 +146,21 @@ def upright_size(path: Path) -> tuple[tuple[int, int], int]:
     """Width and height by an image's header once it is upright, and the EXIF orientation undone for that. Raises
     DecodeError."""
     with _open(path) as image:
+        if undone := _undone_orientation(image):
+            return image.size, undone
         # In a PNG without EXIF before its pixels Pillow would decode these to look behind them.
         orientation = 1 if image.format == "PNG" and "exif" not in image.info else read_exif(image, [])[1]
-        size = image.size if image.format == "TIFF" else turned_size(image.size, orientation)  # Pillow turns a TIFF's
-        return size, orientation
+        return turned_size(image.size, orientation), orientation
+
+
+def _undone_orientation(image: Image.Image) -> int | None:
+    """The EXIF orientation of an image that is turned upright as it is loaded, which forgets it. Of HEIC only that of
+    one held sideways: every program shows HEIC upright, and of masks and cameras by others only the shape tells that.
+    """
+    if image.format == "TIFF":
+        return read_exif(image, [])[1]
+    original = image.info.get("original_orientation") if image.format == "HEIF" else None
+    return original if original in (6, 8) else None
 
 
 def _load(image: Image.Image) -> None:

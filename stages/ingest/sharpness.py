@@ -1,6 +1,6 @@
 """How sharp photos are, and which are far less sharp than those around them; which show nothing at all."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from statistics import median
 
 import cv2
@@ -32,7 +32,7 @@ def at_most(grey: np.ndarray, most: int) -> np.ndarray:
     return cv2.resize(grey, (most, max(1, round(height * most / width))), interpolation=cv2.INTER_AREA)
 
 
-def relative_sharpness(values: Sequence[float], groups: Sequence[int]) -> list[float | None]:
+def relative_sharpness(values: Sequence[float], groups: Sequence[Hashable]) -> list[float | None]:
     """Each sharpness over the median of its neighbours': the NEIGHBOURS before and after it of the same group.
 
     Neighbours show much the same, so the quotient tells blur from a subject with little texture. None where there are

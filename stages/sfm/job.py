@@ -15,7 +15,7 @@ from typing import Any
 from stages.io.files import write_durably
 from stages.io.photos import Photo
 from stages.sfm.colmap.database import (
-    UPRIGHT,
+    NO_TURNS,
     Features,
     image_similarity,
     keep_open,
@@ -67,7 +67,7 @@ class JobState:
         self.job, self.send = job, send
         self.photos = [Photo(**photo) for photo in job.photos]
         self.files = [photo.image_name for photo in self.photos]
-        self.turns = UPRIGHT if job.camera_params else turns_of_cameras(self.photos)
+        self.turns = NO_TURNS if job.camera_params else turns_of_cameras(self.photos)
         self.database, self.images = Path(job.database), Path(job.images)
         self.log = StrategyLog(Path(job.folder, "strategies"))
         self.held = keep_open(self.database)  # the parent reads in it how far we are

@@ -160,7 +160,7 @@ def _check_camera(config: "Config", photos: Sequence[Photo]) -> None:
         raise StageError(
             "sfm.parameters-of-several-cameras",
             what,
-            f"the photos have {len(sizes)} sizes ({listed}), so they come from several cameras",
+            f"the photos have {len(sizes)} sizes ({listed}), and the parameters are for one",
             hint,
         )
     try:

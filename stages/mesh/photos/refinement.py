@@ -6,15 +6,15 @@ along its normal and the agreement is measured at each offset: the mean zero-mea
 pairs of photos, which exposure does not matter to (multi-view stereo on a mesh: Furukawa and Ponce 2010; Vu et al.
 2012). All offsets o, in voxels, are then found together. They minimise
 
-    Σ w (o − ô)² + Σ p o² + SMOOTHNESS Σ over edges (o_i − o_j)² + FAIRNESS Σ s e |curvature|²
+    Σ w (o − ô)² + Σ p o² + SMOOTHNESS Σ over edges (o_i − o_j)² + FAIRNESS Σ s e |umbrella|²
 
 with ô the offset of best agreement and w what it is worth: the curvature of the agreement there, by its height. p is
 PRIOR where two photos show a vertex and UNSEEN elsewhere: a bare wall follows its neighbours, and what no photo sees
-stays. Curvature is that of the moved surface (its umbrella vector, along the normals), and counts where photos tell
-about the surface, s: elsewhere it would shrink what is thin. The umbrella of edges of length h is h² / 4 of the
-curvature, and a vertex stands for an area of h²: e = (FAIR_EDGE / h)⁴ makes a surface as smooth whatever the length of
-its edges, within EDGES. Photos that show a silhouette next to a vertex take no part there: its patch would be one half
-of what moves behind it. Constants: docs/experiments/mesh.md.
+stays. The umbrella vector of the moved surface, along the normals, bends it back. It counts where photos tell about the
+surface, s: elsewhere it would shrink what is thin. That of edges of length h is h² / 4 of the curvature, which
+e = (FAIR_EDGE / h)⁴ undoes, for h within EDGES: a surface is as smooth whatever its edges. Photos that show a
+silhouette next to a vertex take no part there: its patch would be one half of what moves behind it. Constants:
+docs/experiments/mesh.md.
 """
 
 from collections.abc import Callable
@@ -317,11 +317,12 @@ def _balanced(
     stay = np.where(patches.shared(), PRIOR, UNSEEN)
     smooth = SMOOTHNESS * (diags_array(degree + 1) - linked)
     system = (fair + smooth + diags_array(worth + stay)).tocsr()
-    return cg(system, worth * offset - known, rtol=TOLERANCE, maxiter=MAX_ITERATIONS)[0]
+    jacobi = diags_array(1 / system.diagonal())
+    return cg(system, worth * offset - known, rtol=TOLERANCE, maxiter=MAX_ITERATIONS, M=jacobi)[0]
 
 
 def _edge_lengths(surface: Surface, means: csr_array) -> np.ndarray:
-    """Of the edges at each vertex, the root of the mean square, (n,)."""
+    """The root mean square length of the edges at each vertex, (n,)."""
     count = np.diff(means.indptr)  # with the vertex itself
     vertex = np.repeat(np.arange(len(count)), count)
     square = ((surface.vertices[vertex] - surface.vertices[means.indices]) ** 2).sum(axis=1)

@@ -11,6 +11,7 @@ from contextlib import suppress
 from functools import partial
 from itertools import chain, combinations, product
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -46,9 +47,9 @@ MIN_CACHED_PHOTOS, CACHE_SHARE = 256, 0.25
 
 
 Turns = Mapping[str, int]
-"""By image name, of photos that were turned so, how many quarter turns clockwise made them upright. Their cameras see
-them as the sensor has them, without."""
-UPRIGHT: Turns = {}
+"""By image name the quarter turns clockwise that made a photo upright, of photos whose features are kept where their
+sensor had them; all others are absent."""
+NO_TURNS: Turns = MappingProxyType({})
 
 
 def keep_open(database: Path) -> pycolmap.Database:
@@ -78,9 +79,10 @@ def fill_database(
     photos: Sequence[Photo],
     camera_model: str,
     camera_params: Sequence[float] | None = None,
-    turns: Turns = UPRIGHT,
+    turns: Turns = NO_TURNS,
 ) -> None:
-    """Enter photos (in order of ``file``) and one camera per camera group, all or nothing.
+    """Enter photos (in order of ``file``) and their cameras, all or nothing: one for each camera group with ``turns``,
+    and one for each way in which it was held without.
 
     Known ``camera_params`` are those of one camera for all photos.
     """
@@ -89,7 +91,6 @@ def fill_database(
             return
         camera_ids: dict[tuple[int, int | None], int] = {}
         for image_id, photo in enumerate(photos, start=1):
-            # As they are upright, photos that a camera took held otherwise have intrinsics of their own.
             held = None if camera_params or turns else photo.orientation
             group = (0 if camera_params else photo.camera_group, held)
             if group not in camera_ids:
@@ -173,7 +174,7 @@ def extract_features(
     photos: Sequence[Photo],
     extraction: ExtractionOptions,
     on_few: Callable[[float], None] = lambda median: None,
-    turns: Turns = UPRIGHT,
+    turns: Turns = NO_TURNS,
 ) -> None:
     """SIFT keypoints and descriptors of every photo that has none yet, where ``masks/<image name>.png`` is not black,
     or anywhere where that is not there. ``turns`` are those that the database was filled with.

@@ -1,4 +1,4 @@
-"""Cameras of photos as their files store them, turned upright with the photos, as EXIF's orientation asks.
+"""Which imported cameras are of photos as their files store them.
 
 Other programs take pixels as they are stored, ingest turns them upright (stages/ingest/orientation.py).
 """

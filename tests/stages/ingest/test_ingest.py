@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pillow_heif
 import pytest
 from PIL import Image, ImageFilter
 
@@ -162,7 +163,17 @@ def test_a_phone_held_in_any_way_is_one_camera(tmp_path: Path, progress: Any) ->
     mirrored = [2, 4, 5, 7]  # no camera takes such photos
     found = groups(tmp_path, tmp_path / "out", progress)
     assert {found[orientation - 1] for orientation in (1, 3, 6, 8)} == {0}
-    assert len({found[orientation - 1] for orientation in mirrored}) == len(mirrored) and 0 not in found[1:2]
+    assert len({0, *(found[orientation - 1] for orientation in mirrored)}) == 1 + len(mirrored)
+
+
+def test_heic_photos_held_both_ways_are_of_one_camera(tmp_path: Path, progress: Any) -> None:
+    for orientation in (1, 6, 8):
+        pixels = pillow_heif.from_pillow(picture(orientation, width=96))
+        pixels.save(tmp_path / f"{orientation}.heic", exif=exif_with(orientation, Make="A", Model="1").tobytes())
+    assert groups(tmp_path, tmp_path / "out", progress) == [0, 0, 0]
+    photos = read_photos(tmp_path / "out")
+    assert [photo.orientation for photo in photos] == [1, 6, 8]
+    assert [photo.width > photo.height for photo in photos] == [True, False, False]
 
 
 def test_two_phones_in_one_folder_are_two_cameras(tmp_path: Path, progress: Any) -> None:

@@ -66,7 +66,9 @@ def test_short_edges_are_as_smooth_as_long_ones(refined):
 
     def bent(cells):
         """Mean angle (degrees) of faces to the plane, where there is texture and photos enough."""
-        surface = refined(sheet(cells, wavy), noisy).surface
+        found = refined(sheet(cells, wavy), noisy)
+        assert found.kept
+        surface = found.surface
         corners = surface.vertices[surface.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         middle = corners.mean(axis=1)
@@ -74,7 +76,7 @@ def test_short_edges_are_as_smooth_as_long_ones(refined):
         return np.degrees(np.arccos(normals[inner, 2] / np.linalg.norm(normals[inner], axis=1))).mean()
 
     found = [bent(20), bent(40), bent(60)]
-    assert max(found[1:]) < 1.3 * found[0]
+    assert max(found[1:]) < 1.3 * found[0] < 2, "3.4 before"
 
 
 def test_exposures_do_not_matter(refined):

@@ -365,10 +365,10 @@ def test_keypoints_go_back_to_where_the_sensor_has_them(orientation: int) -> Non
     photo = held(Photo("a", "images/a", 60, 40, 0, None, None, False, 1.0), orientation)
     stored = np.concatenate([random.uniform(0, 40, (9, 2)), random.normal(size=(9, 4))], axis=1)
     turn = pixel_map(Camera("SIMPLE_PINHOLE", 60, 40, (50.0, 30.0, 20.0)), turns, photo.width, photo.height)
-    upright = stored.copy()
-    upright[:, :2] = stored[:, :2] @ turn[:, :2].T + turn[:, 2]
-    upright[:, 2:] = (turn[:, :2] @ stored[:, 2:].reshape(-1, 2, 2)).reshape(-1, 4)
-    np.testing.assert_allclose(on_sensor(upright, photo, turns), stored, atol=1e-12)
+    seen = stored.copy()
+    seen[:, :2] = stored[:, :2] @ turn[:, :2].T + turn[:, 2]
+    seen[:, 2:] = (turn[:, :2] @ stored[:, 2:].reshape(-1, 2, 2)).reshape(-1, 4)
+    np.testing.assert_allclose(on_sensor(seen, photo, turns), stored, atol=1e-12)
 
 
 @pytest.mark.parametrize("on_cluster", [False, True])
