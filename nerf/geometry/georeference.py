@@ -4,6 +4,7 @@ The frame is ENU: x east, y north, z up along the ellipsoid's normal (WGS 84), m
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,7 @@ EARTH_AXES_M = (6_378_137.0, 6_356_752.314)  # WGS 84
 MIN_POSITIONS = 4  # three fix a similarity, the fourth tells whether it is right
 OUTLIER_FACTOR = 3.0  # times the median distance: positions so wrong are not averaged with the others
 MAX_TRIMMING_ROUNDS = 10
+TRIPLES = 300  # of positions; where 40 % are wrong every fifth is right
 MIN_WIDTH = 1e-6  # of the centres' coordinates: less across their line is what rounding leaves of them
 EXACT_M = 1e-9  # off by less no position is an outlier: where all are exact, rounding is
 MAX_ERROR = 1 / 3  # of how far apart the positions are: with more they have nothing to do with the photos
@@ -73,8 +75,12 @@ def georeference(
 ) -> Georeference | str:
     """From the photos' centres in the sfm frame and their GPS positions (degrees north and east, metres), or why not.
 
-    Positions far off the rest are left out, round by round. Heights count where every photo has one.
+    Positions far off the rest are left out, round by round. Where at least half of them have heights, the others are
+    left out, too; else no height counts.
     """
+    high = [position[2] is not None for position in positions]
+    if sum(high) >= max(MIN_POSITIONS, len(high) / 2):
+        centres, positions = centres[high], [position for position in positions if position[2] is not None]
     if len(positions) < MIN_POSITIONS:
         return f"{len(positions)} registered photos have a GPS position, and it takes {MIN_POSITIONS}"
     latitude, longitude = np.array([position[:2] for position in positions], float).T
@@ -84,9 +90,8 @@ def georeference(
     middle = int(np.linalg.norm(earth - np.median(earth, axis=0), axis=1).argmin())
     origin = (float(latitude[middle]), float(longitude[middle]), float(altitude[middle]))
     enu = (earth - earth[middle]) @ east_north_up(*origin[:2]).T
-    spread = float(np.linalg.norm(enu - np.median(enu, axis=0), axis=1).max())
-    if spread < GPS_ERROR_M:
-        return f"the positions lie within {spread:.0f} m, and GPS errs by up to {GPS_ERROR_M:.0f} m"
+    if (spread := _spread(enu)) < GPS_ERROR_M:
+        return _too_close(spread)
     width = _across(centres)
     if _across(enu) < GPS_ERROR_M / 2 or not width * np.sqrt(len(centres)) > MIN_WIDTH * np.abs(centres).max():
         return ONE_LINE
@@ -96,11 +101,22 @@ def georeference(
         return ONE_LINE
     if min(fitted.scale * width, _across(enu[kept])) < GPS_ERROR_M / 2:
         return ONE_LINE
+    if (spread := _spread(enu[kept])) < GPS_ERROR_M:
+        return _too_close(spread)
     off = np.linalg.norm(fitted.points(centres) - enu, axis=1)
     error = float(np.median(off[kept]))
     if error > MAX_ERROR * spread:
         return f"the GPS positions span {spread:.0f} m and are {error:.0f} m off the reconstruction"
     return Georeference(fitted, origin, int(kept.sum()), error)
+
+
+def _spread(points: Float[np.ndarray, "n 3"]) -> float:
+    """How far from their middle the farthest is."""
+    return float(np.linalg.norm(points - np.median(points, axis=0), axis=1).max())
+
+
+def _too_close(spread: float) -> str:
+    return f"the positions lie within {spread:.0f} m, and GPS errs by up to {GPS_ERROR_M:.0f} m"
 
 
 def _across(points: Float[np.ndarray, "n 3"]) -> float:
@@ -111,13 +127,44 @@ def _across(points: Float[np.ndarray, "n 3"]) -> float:
 def _robust(
     centres: Float[np.ndarray, "n 3"], enu: Float[np.ndarray, "n 3"]
 ) -> tuple[Similarity, Bool[np.ndarray, "n"]]:
-    """The similarity without outliers, and who is none. Raises ValueError where these lie on one line."""
-    kept = np.ones(len(centres), bool)
+    """The similarity without outliers, and who is none. Raises ValueError where these lie on one line.
+
+    Trimming begins with all positions, and with what three of them say that most others agree with: a few that a phone
+    kept from elsewhere are so far off that a fit to all follows them.
+    """
+    starts = [np.ones(len(centres), bool), _most_agreed(centres, enu)]
+    found = [_trimmed(centres, enu, kept) for kept in starts]
+    return min(found, key=lambda fit: np.median(np.linalg.norm(fit[0].points(centres) - enu, axis=1)))
+
+
+def _trimmed(
+    centres: Float[np.ndarray, "n 3"], enu: Float[np.ndarray, "n 3"], kept: Bool[np.ndarray, "n"]
+) -> tuple[Similarity, Bool[np.ndarray, "n"]]:
     for _ in range(MAX_TRIMMING_ROUNDS):
-        fitted = align(centres[kept], enu[kept])
-        off = np.linalg.norm(fitted.points(centres) - enu, axis=1)
-        now = off <= max(OUTLIER_FACTOR * float(np.median(off)), EXACT_M)
+        now = _near(align(centres[kept], enu[kept]), centres, enu)
         if (now == kept).all():
             break
         kept = now
     return align(centres[kept], enu[kept]), kept
+
+
+def _most_agreed(centres: Float[np.ndarray, "n 3"], enu: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    """Those near the similarity by three positions whose median distance to all is least (least median of squares:
+    Rousseeuw 1984); all, where any three lie on one line."""
+    random, best, agreed = np.random.default_rng(0), np.inf, np.ones(len(centres), bool)
+    for _ in range(TRIPLES):
+        three = random.choice(len(centres), 3, replace=False)
+        with suppress(ValueError):
+            fitted = align(centres[three], enu[three])
+            off = float(np.median(np.linalg.norm(fitted.points(centres) - enu, axis=1)))
+            if off < best:
+                best, agreed = off, _near(fitted, centres, enu)
+    return agreed
+
+
+def _near(
+    fitted: Similarity, centres: Float[np.ndarray, "n 3"], enu: Float[np.ndarray, "n 3"]
+) -> Bool[np.ndarray, "n"]:
+    """Which positions are no outliers."""
+    off = np.linalg.norm(fitted.points(centres) - enu, axis=1)
+    return off <= max(OUTLIER_FACTOR * float(np.median(off)), EXACT_M)

@@ -184,6 +184,10 @@ def _unrecognised(path: Path) -> DecodeError:
         return DecodeError("ingest.stand-in", why)
     if head.startswith((b"\xff\xd8", b"\x89PNG")):
         return _damaged("damaged: its header cannot be read")
+    if head.startswith((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")):
+        return DecodeError(
+            "ingest.kind-of-tiff", "a kind of TIFF that cannot be read; export 8- or 16-bit TIFF, PNG or JPEG"
+        )
     is_text = all(byte in b"\t\r\n" or 32 <= byte < 127 for byte in head)
     why = "not an image: it is text" if is_text else "not an image of a known format"
     return DecodeError("ingest.not-an-image", why)

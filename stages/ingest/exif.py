@@ -83,7 +83,7 @@ def clock_from_exif(tags: dict[str, Any]) -> float | None:
 
 
 def gps_from_exif(tags: dict[str, Any]) -> GpsPosition:
-    """Latitude, longitude and altitude (EXIF 2.32, GPS tags 1 to 6); nothing where they are incomplete, out of range,
+    """Latitude, longitude and altitude (EXIF 3.0, GPS tags 1 to 6); nothing where they are incomplete, out of range,
     or both 0, which is what a receiver writes without a fix."""
     latitude = _degrees(tags.get("GPSLatitude"), tags.get("GPSLatitudeRef"), "NS")
     longitude = _degrees(tags.get("GPSLongitude"), tags.get("GPSLongitudeRef"), "EW")
@@ -92,7 +92,7 @@ def gps_from_exif(tags: dict[str, Any]) -> GpsPosition:
     if latitude == longitude == 0:
         return GpsPosition()
     altitude = _number(tags.get("GPSAltitude"))
-    below_sea = tags.get("GPSAltitudeRef") in (1, b"\x01")
+    below_sea = tags.get("GPSAltitudeRef") in (1, b"\x01", 3, b"\x03")
     if altitude is not None:
         altitude = -altitude if below_sea else altitude
         altitude = altitude if _ALTITUDES_M[0] <= altitude <= _ALTITUDES_M[1] else None

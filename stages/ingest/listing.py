@@ -27,8 +27,10 @@ RAW_EXTENSIONS = (
 )
 # fmt: on
 MASKS = "masks"  # the folder of masks, whatever its letters' case
-# Thumbnails, deleted files and attributes of Synology, QNAP, Windows and macOS, in small letters.
-_OF_SYSTEMS = ("@eadir", "#recycle", "@recycle", "@__thumb", "$recycle.bin", "system volume information", "__macosx")
+# Thumbnails, deleted and lost files and attributes of Synology, QNAP, Windows, macOS and Linux, in small letters.
+_OF_SYSTEMS = (
+    "@eadir", "#recycle", "@recycle", "@__thumb", "$recycle.bin", "system volume information", "__macosx", "lost+found",
+)  # fmt: skip
 MAX_OTHER_FILES = 2  # files beside a video, too few to be a set of photos
 FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
 _LINKS_HINT = "Fetch them (git annex get, dvc pull), or connect the drive that holds them."

@@ -6,7 +6,7 @@ Cheap: lists folders and reads at most the JSON of a transforms file, never an i
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path, PurePosixPath
@@ -192,11 +192,15 @@ def unused_masks(source: Source) -> Path | None:
         return None
     names = [source.name(file) for file in source.files]
     folders = [source.root.parent, *([source.cameras.parent] if source.cameras else [])]
-    named = [child for folder in folders for child in sorted(folder.iterdir()) if _OF_MASKS.fullmatch(child.name)]
+    named = list[Path]()
+    for folder in folders:
+        with suppress(PermissionError):  # nobody gave it
+            named += [child for child in sorted(folder.iterdir()) if _OF_MASKS.fullmatch(child.name)]
     for folder in filter(Path.is_dir, named):
-        inside = files_below(folder, lambda _: True)
-        if pair_masks(names, [(_name(folder, file), file) for file in inside])[0]:
-            return folder
+        with suppress(PermissionError):
+            inside = files_below(folder, lambda _: True)
+            if pair_masks(names, [(_name(folder, file), file) for file in inside])[0]:
+                return folder
     return None
 
 
@@ -258,9 +262,11 @@ def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], 
 
 
 def _named_masks(holder: Path, reduced: str = "") -> list[Path]:
-    """The folders of masks in a folder: Masks is one, too; of ``images_4`` those are in ``masks_4``."""
-    with os.scandir(holder) if holder.is_dir() else nullcontext(()) as entries:
+    """The folders of masks in a folder: Masks is one, too; of ``images_4`` those are in ``masks_4``. None in one that
+    cannot be read, as that around the photos may be."""
+    with suppress(PermissionError, FileNotFoundError, NotADirectoryError), os.scandir(holder) as entries:
         return sorted(Path(one) for one in entries if one.name.lower() == MASKS + reduced and one.is_dir())
+    return []
 
 
 def _beside(source: Source) -> tuple[tuple[str, Path], ...]:

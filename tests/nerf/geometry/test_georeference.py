@@ -68,10 +68,31 @@ def test_it_says_why_not(enu: np.ndarray, why: str) -> None:
     assert why in str(georeference(SFM_FROM_ENU.points(enu), places(enu)))
 
 
-def test_without_all_heights_none_counts() -> None:
-    enu = walked() * [1, 1, 0]
+@pytest.mark.parametrize("stale", [2, 5, 8])
+def test_positions_kept_from_elsewhere_do_no_harm(stale: int) -> None:
+    """What a phone says until it has a fix: 300 m off, where all photos are within 20 m."""
+    for seed in range(10):
+        enu = walked(20, radius_m=20)
+        told = enu + np.random.default_rng(seed).normal(0, 2, enu.shape)
+        told[:stale] = [300, 100, 20]
+        found = georeference(SFM_FROM_ENU.points(enu), places(told))
+        assert isinstance(found, Georeference)
+        assert found.used <= 20 - stale and found.error_m < 6
+        assert found.enu_from_sfm.scale == pytest.approx(1 / 0.13, rel=0.2)
+
+
+def test_a_photo_without_height_is_left_out() -> None:
+    enu = walked() + np.linspace(0, 60, 12)[:, None] * [0, 0, 1]  # round a tower and up
     known = places(enu)
     known[4] = (*known[4][:2], None)
+    found = georeference(SFM_FROM_ENU.points(enu), known)
+    assert isinstance(found, Georeference) and found.used == 11
+    assert found.enu_from_sfm.scale == pytest.approx(1 / 0.13, rel=1e-3)
+
+
+def test_where_most_have_no_height_none_counts() -> None:
+    enu = walked() * [1, 1, 0]
+    known = [place if index < 5 else (*place[:2], None) for index, place in enumerate(places(enu))]
     found = georeference(SFM_FROM_ENU.points(enu), known)
     assert isinstance(found, Georeference) and found.origin[2] == 0 and found.used == 12
 

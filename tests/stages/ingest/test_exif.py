@@ -144,7 +144,13 @@ def test_a_place_that_cannot_be_is_none(wrong: dict[str, object]) -> None:
 def test_altitudes_stand_for_themselves() -> None:
     place = gps_from_exif(GREENWICH)
     assert place[:2] == pytest.approx((51.477222, -0.0005), abs=1e-6) and place.altitude_m is None
-    for value, level, expected in ((46.0, b"\0", 46.0), (12.5, 1, -12.5), (1e9, 0, None), (float("nan"), 0, None)):
+    for value, level, expected in (
+        (46.0, b"\0", 46.0),
+        (12.5, 1, -12.5),
+        (30.0, b"\3", -30.0),
+        (1e9, 0, None),
+        (float("nan"), 0, None),
+    ):
         tags = GREENWICH | {"GPSAltitude": value, "GPSAltitudeRef": level}
         assert gps_from_exif(tags) == GpsPosition(place.latitude, place.longitude, expected)
 

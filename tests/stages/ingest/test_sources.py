@@ -298,7 +298,13 @@ def test_photos_that_no_frame_names_are_listed(tmp_path: Path) -> None:
 
 
 def test_what_systems_keep_is_no_photo(tmp_path: Path) -> None:
-    kept = ["@eaDir/a.jpg/SYNOPHOTO_THUMB_M.jpg", "$RECYCLE.BIN/$R1.jpg", "__MACOSX/._a.jpg", "#recycle/b.jpg"]
+    kept = [
+        "@eaDir/a.jpg/SYNOPHOTO_THUMB_M.jpg",
+        "$RECYCLE.BIN/$R1.jpg",
+        "__MACOSX/._a.jpg",
+        "#recycle/b.jpg",
+        "lost+found/1",
+    ]
     touch(tmp_path, "a.jpg", "sub/b.jpg", "sub/@eaDir/b.jpg", *kept)
     assert names(find_source(tmp_path)) == ["a.jpg", "sub/b.jpg"]
 
@@ -513,6 +519,20 @@ def test_a_folder_without_read_permission(tmp_path: Path) -> None:
         assert refusal(tmp_path).code == "ingest.cannot-read"
     finally:
         (tmp_path / "a").chmod(0o755)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_places_that_nobody_gave_need_not_be_readable(tmp_path: Path) -> None:
+    touch(tmp_path, "closed/images/a.jpg", "closed/my_masks/a.png")
+    closed = tmp_path / "closed"
+    for hidden in (closed / "my_masks", closed):
+        hidden.chmod(0o311)
+    try:
+        source = find_source(closed / "images")
+        assert names(source) == ["a.jpg"] and source.masks == () and unused_masks(source) is None
+    finally:
+        for hidden in (closed, closed / "my_masks"):
+            hidden.chmod(0o755)
 
 
 def test_dead_links_are_refused_by_name(tmp_path: Path) -> None:
