@@ -55,12 +55,12 @@ def errors(
     model: SparseModel, reference: dict[str, dict[str, list]], turns: dict[str, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Distances of the centres in millimetres and angles between the rotations in degrees, per photo; ``turns``: by
-    file, how many quarter turns clockwise made it upright."""
+    file, how many quarter turns clockwise made it upright, where any did."""
     measured = [reference[image.file] for image in model.images]
     rotations = np.array([camera["world_from_camera_rotation"] for camera in measured])
     centres = np.array([camera["camera_center_m"] for camera in measured])
     poses = np.concatenate([rotations, centres[:, :, None]], axis=2)
-    upright = [turned_pose(pose, turns[image.file]) for pose, image in zip(poses, model.images, strict=True)]
+    upright = [turned_pose(pose, turns.get(image.file, 0)) for pose, image in zip(poses, model.images, strict=True)]
     distances, degrees = apart(model, np.stack(upright))
     return 1000 * distances, degrees
 

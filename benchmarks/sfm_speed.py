@@ -88,7 +88,7 @@ def quality(model: SparseModel, reference: Path) -> dict[str, Any]:
     found = {"registered": len(model.images), "points": len(model.xyz), "reprojection_px": model.error_px.mean()}
     if not reference.exists():
         return found | {"centres_mm": None, "rotations_deg": None}
-    millimetres, degrees = errors(model, json.loads(reference.read_text()))
+    millimetres, degrees = errors(model, json.loads(reference.read_text()), {})
     return found | {"centres_mm": millimetres.mean(), "rotations_deg": np.mean(degrees)}
 
 

@@ -6,6 +6,7 @@ Other programs take pixels as they are stored, ingest turns them upright (stages
 from nerf.geometry.scene import Camera
 from stages.ingest.orientation import turned_size
 from stages.io.photos import Photo
+from stages.sfm.colmap.cameras import focal_lengths_and_centre
 
 ASPECT_WITHIN = 0.01
 
@@ -24,6 +25,19 @@ def same_shape(camera: Camera, size: tuple[int, int]) -> bool:
 def fits_only_upright(camera: Camera, photo: Photo) -> bool:
     """Whether the photo has the camera's shape once it is upright, and not as its file stores it."""
     return same_shape(camera, (photo.width, photo.height)) and not same_shape(camera, stored_size(photo))
+
+
+def is_centred_upright(camera: Camera, photo: Photo) -> bool:
+    """Whether the principal point is nearer the middle of the upright photo than of what its file stores: lenses are
+    centred to a percent or two."""
+    _, centre = focal_lengths_and_centre(camera)
+    if not centre:  # a panorama
+        return False
+    off = [
+        max(abs(at / side - 0.5) for at, side in zip(centre, size, strict=True))
+        for size in ((photo.width, photo.height), stored_size(photo))
+    ]
+    return off[0] < off[1]
 
 
 def is_of_stored_pixels(camera: Camera, photo: Photo, upright: bool) -> bool:

@@ -20,11 +20,12 @@ from stages.io.transforms_files import (
 )
 from stages.sfm.imported.conventions import SAME_POSE_WITHIN, PoseConvention, world_from_camera
 from stages.sfm.imported.imported_poses import MAX_NAMES, ImportedPoses, few, notes_on_photos, nothing_matches
-from stages.sfm.imported.orientation import fits_only_upright, stored_size
+from stages.sfm.imported.orientation import fits_only_upright, is_centred_upright, stored_size
 from stages.sfm.imported.posed_photos import PosedPhoto, distinct, posed_photo, unusable, without_rays
 from stages.sfm.imported.rotations import NearestRotation, rigid
 from stages.sfm.imported.transforms_intrinsics import (
     IN_PIXELS,
+    SIZE,
     contradictions,
     intrinsics_of,
     is_one_angle,
@@ -268,11 +269,14 @@ def _check_shared(files: Sequence[Mapping[str, Any]], framed: Sequence[_Framed])
 def _are_of_upright_photos(framed: Iterable[_Framed]) -> bool:
     """Whether the cameras are of photos that were turned upright first, as their shapes alone do not tell of half turns
     and squares: a frame names the photo beside the decoded, upright picture that its camera is of, as in our own
-    exports, or fits a photo only when that is upright."""
-    return any(
-        isinstance(one.frame.get("photo"), str) or fits_only_upright(_given_camera(one, upright=False), one.photo)
-        for one in framed
-    )
+    exports, or fits a photo only when that is upright: by its size or, without one, by its principal point."""
+    return any(isinstance(one.frame.get("photo"), str) or _is_of_upright_photo(one) for one in framed)
+
+
+def _is_of_upright_photo(framed: _Framed) -> bool:
+    camera = _given_camera(framed, upright=False)
+    fits = fits_only_upright if framed.values.keys() >= {*SIZE} else is_centred_upright
+    return fits(camera, framed.photo)
 
 
 def _given_camera(framed: _Framed, upright: bool) -> Camera:

@@ -122,6 +122,19 @@ def test_cameras_of_stored_pixels_turn_with_their_photos(
     assert ("sfm.turned-upright" in progress.codes) == (orientation != 1)
 
 
+@pytest.mark.parametrize("orientation", [6, 8])
+def test_the_principal_point_tells_of_upright_photos(orientation: int, tmp_path: Path, progress: Any) -> None:
+    names = photo_set(tmp_path / "photos", orientation)
+    given = LENS | {"cx": 18.0, "cy": 31.0}  # of pictures of 40 × 60
+    (tmp_path / "given.json").write_text(json.dumps({**given, "frames": frames_of(names)}))
+    model, _ = imported(tmp_path / "given.json", tmp_path / "photos", tmp_path, progress)
+    (camera,) = model.cameras
+    assert (camera.width, camera.height) == (HEIGHT, WIDTH)
+    np.testing.assert_allclose(camera.params[:4], (50.0, 52.0, 18.0, 31.0))
+    np.testing.assert_allclose(model.images[0].sfm_from_camera, ring(4)[0], atol=1e-9)
+    assert "sfm.turned-upright" not in progress.codes
+
+
 @pytest.mark.parametrize("orientation", [3, 6])
 def test_our_own_export_is_of_upright_photos_and_comes_back(orientation: int, tmp_path: Path, progress: Any) -> None:
     names = photo_set(tmp_path / "photos", orientation)
