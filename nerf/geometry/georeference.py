@@ -103,8 +103,7 @@ def georeference(
         return ONE_LINE
     if (spread := _spread(enu[kept])) < GPS_ERROR_M:
         return _too_close(spread)
-    off = np.linalg.norm(fitted.points(centres) - enu, axis=1)
-    error = float(np.median(off[kept]))
+    error = float(np.median(_distances(fitted, centres, enu)[kept]))
     if error > MAX_ERROR * spread:
         return f"the GPS positions span {spread:.0f} m and are {error:.0f} m off the reconstruction"
     return Georeference(fitted, origin, int(kept.sum()), error)
@@ -134,7 +133,7 @@ def _robust(
     """
     starts = [np.ones(len(centres), bool), _most_agreed(centres, enu)]
     found = [_trimmed(centres, enu, kept) for kept in starts]
-    return min(found, key=lambda fit: np.median(np.linalg.norm(fit[0].points(centres) - enu, axis=1)))
+    return min(found, key=lambda fit: np.median(_distances(fit[0], centres, enu)))
 
 
 def _trimmed(
@@ -151,20 +150,26 @@ def _trimmed(
 def _most_agreed(centres: Float[np.ndarray, "n 3"], enu: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
     """Those near the similarity by three positions whose median distance to all is least (least median of squares:
     Rousseeuw 1984); all, where any three lie on one line."""
-    random, best, agreed = np.random.default_rng(0), np.inf, np.ones(len(centres), bool)
+    random, fits = np.random.default_rng(0), list[Similarity]()
     for _ in range(TRIPLES):
         three = random.choice(len(centres), 3, replace=False)
         with suppress(ValueError):
-            fitted = align(centres[three], enu[three])
-            off = float(np.median(np.linalg.norm(fitted.points(centres) - enu, axis=1)))
-            if off < best:
-                best, agreed = off, _near(fitted, centres, enu)
-    return agreed
+            fits.append(align(centres[three], enu[three]))
+    if not fits:
+        return np.ones(len(centres), bool)
+    return _near(min(fits, key=lambda fit: np.median(_distances(fit, centres, enu))), centres, enu)
+
+
+def _distances(
+    fitted: Similarity, centres: Float[np.ndarray, "n 3"], enu: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n"]:
+    """How far the positions are off, in metres."""
+    return np.linalg.norm(fitted.points(centres) - enu, axis=1)
 
 
 def _near(
     fitted: Similarity, centres: Float[np.ndarray, "n 3"], enu: Float[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, "n"]:
     """Which positions are no outliers."""
-    off = np.linalg.norm(fitted.points(centres) - enu, axis=1)
+    off = _distances(fitted, centres, enu)
     return off <= max(OUTLIER_FACTOR * float(np.median(off)), EXACT_M)

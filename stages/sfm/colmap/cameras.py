@@ -131,14 +131,14 @@ def turned_pose(world_from_camera: Float[np.ndarray, "3 4"], turns: int) -> Floa
     return np.concatenate([rotation, world_from_camera[:, 3:]], axis=1)
 
 
-def pixel_map(camera: Camera, turns: int, width: int, height: int) -> Float[np.ndarray, "2 3"]:
-    """Takes pixels (x, y, 1) of the camera to those of its picture after so many quarter turns clockwise and resized to
-    width × height."""
-    pixels, size = np.eye(3), (camera.width, camera.height)
+def pixel_map(size: tuple[int, int], turns: int, width: int, height: int) -> Float[np.ndarray, "2 3"]:
+    """Takes pixels (x, y, 1) of a picture of this width and height to those after so many quarter turns clockwise and
+    resized to width × height."""
+    pixels = np.eye(3)
     for _ in range(turns):
         turn = _CLOCKWISE.copy()
         turn[0, 2] = size[1]
-        pixels, size = turn @ pixels, size[::-1]
+        pixels, size = turn @ pixels, (size[1], size[0])
     return np.diag([width / size[0], height / size[1]]) @ pixels[:2]
 
 

@@ -23,6 +23,7 @@ from stages.hardware.device import processors
 from stages.hardware.memory import at_once, available_bytes
 from stages.ingest.orientation import QUARTER_TURNS
 from stages.io.photos import Photo, spread
+from stages.sfm.colmap.cameras import pixel_map
 from stages.sfm.pairs.feature_matching import IndexedFeatures, index_features, match_descriptors, match_indexed
 from stages.sfm.pairs.image_retrieval import WORDS, Words, photo_similarity, vocabulary
 from stages.sfm.pairs.pair_selection import Pairs, SimilarityMatrix
@@ -95,11 +96,14 @@ def fill_database(
             group = (0 if camera_params else photo.camera_group, held)
             if group not in camera_ids:
                 camera_ids[group] = len(camera_ids) + 1
-                sideways = turns.get(photo.image_name, 0) % 2
-                size = (photo.height, photo.width) if sideways else (photo.width, photo.height)
+                size = _size_on_sensor(photo, turns.get(photo.image_name, 0))
                 camera = _first_guess(size, photo.focal_px, camera_model, camera_params, camera_ids[group])
                 _enter_camera(db, camera)
             _enter_image(db, photo.image_name, camera_ids[group], image_id)
+
+
+def _size_on_sensor(photo: Photo, turns: int) -> tuple[int, int]:
+    return (photo.height, photo.width) if turns % 2 else (photo.width, photo.height)
 
 
 def _enter_image(db: pycolmap.Database, name: str, camera_id: int, image_id: int) -> None:
@@ -257,12 +261,10 @@ def _extract(
 
 def on_sensor(keypoints: np.ndarray, photo: Photo, turns: int) -> np.ndarray:
     """Keypoints (n, 6) of an upright photo, x, y and the affine shape by rows, where they were before so many turns."""
-    width, height = photo.width, photo.height
-    x, y, *shape = keypoints.T
-    for _ in range(turns):
-        x, y, shape = y, width - x, [shape[2], shape[3], -shape[0], -shape[1]]
-        width, height = height, width
-    return np.stack([x, y, *shape], axis=1)
+    back = pixel_map((photo.width, photo.height), -turns % 4, *_size_on_sensor(photo, turns))
+    places = keypoints[:, :2] @ back[:, :2].T + back[:, 2]
+    shapes = back[:, :2] @ keypoints[:, 2:].reshape(-1, 2, 2)
+    return np.concatenate([places, shapes.reshape(-1, 4)], axis=1)
 
 
 def _extract_apart(images: Path, extraction: ExtractionOptions, photos: Sequence[Photo]) -> list[Extracted]:

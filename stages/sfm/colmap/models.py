@@ -82,7 +82,10 @@ def turned_upright(model: pycolmap.Reconstruction, turns: Mapping[str, int]) -> 
             camera_ids[key] = len(camera_ids) + 1
             new.add_camera_with_trivial_rig(native(camera, camera_ids[key]))
         places = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
-        places = np.c_[places, np.ones(len(places))] @ pixel_map(before, by, camera.width, camera.height).T
+        places = (
+            np.c_[places, np.ones(len(places))]
+            @ pixel_map((before.width, before.height), by, camera.width, camera.height).T
+        )
         points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in places])
         entry = pycolmap.Image(name=image.name, camera_id=camera_ids[key], image_id=image_id, points2D=points2D)
         pose = turned_pose(image.cam_from_world().inverse().matrix(), by)

@@ -37,9 +37,10 @@ def read_colmap_model(folder: Path, photos: Sequence[Photo], convention: PoseCon
         posed[i] = posed_photo(photo_of[i], image.file, where, given.cameras[image.camera], pose, upright)
     left_out = without_rays(posed.values())
     kept = {i: one for i, one in posed.items() if one.file not in left_out}
+    before = [given.cameras[given.images[i].camera] for i in kept]
     pixel_maps = [
-        pixel_map(given.cameras[given.images[i].camera], one.turns, one.photo.width, one.photo.height)
-        for i, one in kept.items()
+        pixel_map((camera.width, camera.height), one.turns, one.photo.width, one.photo.height)
+        for camera, one in zip(before, kept.values(), strict=True)
     ]
     cameras, images = distinct(kept.values())
     model, behind = given.restricted(list(kept), pixel_maps, cameras, images).without_points_behind()

@@ -3,7 +3,6 @@
 import numpy as np
 import pycolmap
 
-from nerf.geometry.scene import Camera
 from stages.sfm.colmap.cameras import pixel_map
 from stages.sfm.colmap.models import turned_upright
 from stages.sfm.colmap.observations import observations, residuals
@@ -38,7 +37,7 @@ def test_places_in_a_photo_turn_with_it() -> None:
     model = photographed(LENS, photos=6)
     upright = turned_upright(model, TURNS)
     size = (HEIGHT, WIDTH)
-    turn = pixel_map(Camera(LENS.model, WIDTH, HEIGHT, LENS.params), 1, *size)
+    turn = pixel_map((WIDTH, HEIGHT), 1, *size)
     before = np.array([point.xy for point in model.image(2).points2D])
     after = np.array([point.xy for point in upright.image(2).points2D])
     np.testing.assert_allclose(after, before @ turn[:, :2].T + turn[:, 2], atol=1e-9)

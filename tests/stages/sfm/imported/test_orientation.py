@@ -63,7 +63,9 @@ def test_a_turned_camera_sees_points_as_its_picture(model: str, orientation: int
     column, row = np.floor(seen).astype(int).T
     expected = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), axis=-1).reshape(-1, 2)
     np.testing.assert_array_equal(shown[row, column, :2], expected)
-    mapped = np.column_stack([expected + 0.5, np.ones(len(seen))]) @ pixel_map(camera, turns, *shown.shape[1::-1]).T
+    mapped = (
+        np.column_stack([expected + 0.5, np.ones(len(seen))]) @ pixel_map((WIDTH, HEIGHT), turns, *shown.shape[1::-1]).T
+    )
     np.testing.assert_allclose(mapped, seen, atol=1e-3)
     assert np.linalg.det(turned_to[:, :3]) == pytest.approx(1)
 
@@ -72,7 +74,7 @@ def test_four_quarter_turns_change_nothing() -> None:
     pose = ring(3)[1]
     np.testing.assert_allclose(turned_camera(OPENCV, 4).params, OPENCV.params)
     np.testing.assert_allclose(turned_pose(pose, 4), pose)
-    half = pixel_map(OPENCV, 4, WIDTH // 2, HEIGHT)
+    half = pixel_map((WIDTH, HEIGHT), 4, WIDTH // 2, HEIGHT)
     np.testing.assert_allclose(half, [[0.5, 0, 0], [0, 1, 0]])
 
 
