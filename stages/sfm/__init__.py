@@ -100,16 +100,22 @@ class Config(StageConfig):
     matcher: Auto[Matcher] = Field(
         default=None,
         description=(
-            "How image pairs are selected: all pairs, by time, by GPS position, or by image retrieval (default: "
-            "exhaustive for up to 50 photos, else chosen from EXIF data)."
+            "How the first image pairs are selected: all pairs, by time, by GPS position, or by image retrieval "
+            "(default: exhaustive for up to 50 photos, else sequential for frames of a video, spatial for photos with "
+            "GPS that stand apart, else retrieval)."
         ),
     )
-    neighbours: int = Field(default=30, ge=1, description="Pairs per photo when not all pairs are matched.")
+    neighbours: int = Field(
+        default=30,
+        ge=1,
+        description="Pairs per photo when not all pairs are matched; more where few of a photo's pairs verify.",
+    )
     max_strategies: int = Field(
         default=MAX_STRATEGIES,
         ge=1,
         le=MAX_STRATEGIES,
-        description="How many strategies to try while images are unregistered; 1 tries the default strategy only.",
+        description="How many strategies of the list to consider while images are unregistered, skipped ones "
+        "included; 1 tries the default strategy only.",
     )
     seconds: Auto[float] = Field(
         default=None,
