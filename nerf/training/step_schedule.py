@@ -113,7 +113,8 @@ def revised_by_clock(
     ``tolerance`` seconds early or late. Its progress is then that of the time, so that a schedule which the clock
     proved wrong leaves no trace in the learning rates."""
     left = budget - seconds
-    if abs((schedule.total_steps - step) / steps_per_second - left) <= tolerance:
+    nearest = 0.51 / steps_per_second  # whole steps come no nearer than half of one; the rest is rounding
+    if abs((schedule.total_steps - step) / steps_per_second - left) <= max(tolerance, nearest):
         return schedule
     total = steps_that_fit(step, left, steps_per_second)
     return schedule if total == schedule.total_steps else schedule.revised(step, total, min(1.0, seconds / budget))

@@ -1,7 +1,7 @@
 from itertools import pairwise
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from nerf.training.step_schedule import (
@@ -105,6 +105,7 @@ def test_a_run_has_steps() -> None:
         new_schedule(0)
 
 
+@example(budget=10.0, rate=1.25)  # 12.5 steps
 @given(st.floats(0.01, 1000), st.floats(0.01, 1000))
 def test_a_run_on_a_steady_clock_ends_on_time(budget: float, rate: float) -> None:
     plan, step = new_schedule(10**6), 0
