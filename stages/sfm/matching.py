@@ -92,10 +92,13 @@ def _extract(database: Path, extraction: ExtractionOptions, state: JobState) -> 
     state.end("features")
 
 
-def _note_few_features(state: JobState, median: float) -> None:
-    few = f"the photos yield few features (median {median:,.0f})"
-    what = f"{few}: extracting from photos enlarged to four times the pixels"
-    state.send(note=Note("sfm.features-enlarged", what))
+def _note_few_features(state: JobState, median: float, chosen: ExtractionOptions) -> None:
+    few = f"the photos yield few features (median {median:,.0f}): extracting from photos"
+    if chosen.equalised:
+        note = Note("sfm.contrast-equalised", f"{few} of low contrast, which is raised for that")
+    else:
+        note = Note("sfm.features-enlarged", f"{few} enlarged to four times the pixels")
+    state.send(note=note)
 
 
 def _match_all(database: Path, state: JobState) -> dict[str, Any] | None:

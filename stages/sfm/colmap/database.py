@@ -14,15 +14,17 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
+import cv2
 import numpy as np
 import pycolmap
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 
 from stages.hardware import cluster
 from stages.hardware.device import processors
 from stages.hardware.memory import at_once, available_bytes
 from stages.ingest.orientation import QUARTER_TURNS
 from stages.io.photos import Photo, spread
+from stages.io.pixels import load_pixels
 from stages.sfm.colmap.cameras import pixel_map
 from stages.sfm.pairs.feature_matching import IndexedFeatures, index_features, match_descriptors, match_indexed
 from stages.sfm.pairs.image_retrieval import WORDS, Words, photo_similarity, vocabulary
@@ -37,8 +39,13 @@ BLOCK_SIZE = 32  # pairs of photos that are worked on and committed at once (pro
 MAPPING_MODEL = "SIMPLE_RADIAL"  # one focal length and one distortion term hold with few matches
 FISHEYE_MODEL = "SIMPLE_RADIAL_FISHEYE"
 FISHEYE_ANGLE_DEG = 150.0
-# Of the maximum: where the median of so many photos has fewer, photos are enlarged (docs/experiments/few_features.md).
+# Of the maximum: where the median of so many photos has fewer, photos are enlarged, or their contrast is equalised
+# (docs/experiments/few_features.md).
 MIN_FEATURES_SHARE, COUNTED_PHOTOS = 0.25, 12
+# Equalised photos: mean and standard deviation within a Gaussian window, whose own deviation is a share of the longer
+# side; they are taken from a photo of so many pixels. What varies by less than three levels is mostly noise.
+EQUAL_MEAN, EQUAL_DEVIATION, MIN_DEVIATION = 128.0, 40.0, 3.0
+WINDOW, WINDOWED_PIXELS = 0.02, 200
 BYTES_PER_PIXEL = 100  # 77 to 86 measured on photos of 1024 to 3200 pixels
 PHOTOS_AT_A_TIME = 2  # of a cluster's core: to make a database for them takes a twentieth of a second
 OPENINGS, PAUSE_SECONDS = 50, 0.1  # a reader holds the lock for milliseconds
@@ -144,12 +151,14 @@ def _enter_camera(db: pycolmap.Database, camera: pycolmap.Camera) -> None:
 
 class ExtractionOptions(NamedTuple):
     """How features are extracted: the longer side in pixels that photos are reduced to, the maximum for each photo, the
-    folder of masks, and up to which longer side photos are doubled first: smaller ones yield too few features."""
+    folder of masks, up to which longer side photos are doubled first, since smaller ones yield too few features, and
+    whether their contrast is equalised before."""
 
     max_image_size: int
     max_features: int
     masks: Path | None = None
     doubled_up_to: int = 1024
+    equalised: bool = False
 
     def doubles(self, photo: Photo) -> bool:
         """Whether a photo is doubled before its features are extracted."""
@@ -159,6 +168,12 @@ class ExtractionOptions(NamedTuple):
         """Twice as many from about four times the pixels: of large photos their own, of others doubled ones."""
         twice = {"max_image_size": 2 * self.max_image_size, "max_features": 2 * self.max_features}
         return self._replace(**twice, doubled_up_to=3 * self.max_image_size // 2)
+
+    def for_few_features(self, photos: Sequence[Photo]) -> "list[ExtractionOptions]":
+        """What to try where these photos yield few features: more pixels, which doubled ones have already, then more
+        contrast."""
+        larger = [] if all(map(self.doubles, photos)) else [self.larger()]
+        return [*larger, self._replace(equalised=True)]
 
 
 def feature_bytes(photos: Sequence[Photo], extraction: ExtractionOptions) -> float:
@@ -177,7 +192,7 @@ def extract_features(
     images: Path,
     photos: Sequence[Photo],
     extraction: ExtractionOptions,
-    on_few: Callable[[float], None] = lambda median: None,
+    on_few: Callable[[float, ExtractionOptions], None] = lambda median, chosen: None,
     turns: Turns = NO_TURNS,
 ) -> None:
     """SIFT keypoints and descriptors of every photo that has none yet, where ``masks/<image name>.png`` is not black,
@@ -185,25 +200,32 @@ def extract_features(
 
     The scale space begins at the photos' own size. Doubling them first, as is COLMAP's habit, costs 4.5 times as
     much and moves no camera of a well-sized photo (benchmarks/sfm_accuracy.py), so only small ones are doubled. Where
-    half of some photos yield few features, as smooth or dark things do, all are enlarged: those of an enlarged photo
-    hardly match those of another that is not. ``on_few`` is told then what the photos yield at their own size.
+    half of some photos yield few features, as smooth things do, all are enlarged: those of an enlarged photo hardly
+    match those of another that is not. Where that is no help, as in fog, under water and in the dark, the contrast of
+    all is equalised: SIFT counts it in absolute grey levels. ``on_few`` is told then what the photos yield as they
+    are, and what was chosen.
     """
     with pycolmap.Database.open(database) as db:
         todo = [number for number in range(len(photos)) if not db.exists_descriptors(number + 1)]
-    large = [number for number, photo in enumerate(photos) if not extraction.doubles(photo)]
-    if todo and large:
-        some = [large[place] for place in spread(len(large), min(len(large), COUNTED_PHOTOS))]
-        with tempfile.TemporaryDirectory(dir=database.parent) as folder:
-            counted = Path(folder, "some.db")
-            fill_database(counted, [photos[number] for number in some], MAPPING_MODEL, turns=turns)
-            _extract(counted, images, [photos[number] for number in some], extraction, turns)
-            yielded = _median_features(counted, len(some))
-            if yielded < MIN_FEATURES_SHARE * extraction.max_features:
-                on_few(yielded)
-                extraction = extraction.larger()
-            else:
-                _copy_features(counted, database, some)
-    _extract(database, images, [photos[number] for number in todo], extraction, turns)
+    if not todo:
+        return
+    some = spread(len(photos), min(len(photos), COUNTED_PHOTOS))
+    counted = [photos[number] for number in some]
+    few, yielded = MIN_FEATURES_SHARE * extraction.max_features, []
+    ways = [extraction, *extraction.for_few_features(counted)]
+    with tempfile.TemporaryDirectory(dir=database.parent) as folder:
+        for way in ways:
+            tried = Path(folder, f"{len(yielded)}.db")
+            fill_database(tried, counted, MAPPING_MODEL, turns=turns)
+            _extract(tried, images, counted, way, turns)
+            yielded.append(_median_features(tried, len(some)))
+            if yielded[-1] >= few:
+                break
+        best = int(np.argmax(yielded))
+        if best:
+            on_few(yielded[0], ways[best])
+        _copy_features(Path(folder, f"{best}.db"), database, some)
+    _extract(database, images, photos, ways[best], turns)
 
 
 def _median_features(database: Path, count: int) -> float:
@@ -240,7 +262,7 @@ def _extract(
     def here(
         work: Callable[[Sequence[Photo]], list[Extracted]], groups: Iterable[Sequence[Photo]]
     ) -> Iterable[list[Extracted]]:
-        if not turns:
+        if not turns and not extraction.equalised:
             _extract_here(database, images, photos, extraction, threads)  # COLMAP writes them itself
             return
         with ThreadPoolExecutor(threads) as pool:
@@ -272,10 +294,39 @@ def _extract_apart(images: Path, extraction: ExtractionOptions, photos: Sequence
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder, "apart.db")
         fill_database(database, photos, MAPPING_MODEL)
+        images = _equalised(images, photos, Path(folder, "images")) if extraction.equalised else images
         _extract_here(database, images, photos, extraction, threads=1)
         with pycolmap.Database.open(database) as db:
             numbers = range(1, len(photos) + 1)
             return [(np.array(db.read_keypoints(number)), db.read_descriptors(number)) for number in numbers]
+
+
+def _equalised(images: Path, photos: Sequence[Photo], folder: Path) -> Path:
+    """``folder``, with these photos in grey, their contrast equalised."""
+    for photo in photos:
+        pixels = load_pixels(images / photo.image_name, photo.width, photo.height)
+        grey = equalise_contrast(cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY))
+        file = folder / photo.image_name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(cv2.imencode(file.suffix, grey, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes())
+    return folder
+
+
+def equalise_contrast(grey: UInt8[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
+    """A photo whose mean and standard deviation are EQUAL_MEAN and EQUAL_DEVIATION around every pixel, but where it
+    hardly varies."""
+    height, width = grey.shape
+    scale = WINDOWED_PIXELS / max(height, width)
+    reduced = max(1, round(scale * width)), max(1, round(scale * height))
+    values = grey.astype(np.float32)
+    mean, square = (
+        cv2.GaussianBlur(cv2.resize(of, reduced, interpolation=cv2.INTER_AREA), (0, 0), WINDOW * WINDOWED_PIXELS)
+        for of in (values, values * values)
+    )
+    deviation = np.sqrt(np.maximum(square - mean * mean, MIN_DEVIATION**2))
+    values -= cv2.resize(mean, (width, height))
+    values *= EQUAL_DEVIATION / cv2.resize(deviation, (width, height))
+    return np.clip(np.rint(values + EQUAL_MEAN), 0, 255).astype(np.uint8)
 
 
 def _extract_here(
