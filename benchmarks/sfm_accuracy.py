@@ -1,6 +1,7 @@
 """How far the cameras that stage sfm finds are from measured ones, or from those that came with the photos.
 
     python -m benchmarks.sfm_accuracy DATA [--camera-model OPENCV] [--sets fountain_p11 herzjesu_p8 fox] [--turned 3]
+        [--contrast 0.12]
 
 DATA holds a folder per set: photos, and reference_cameras.json with K (px), world_from_camera_rotation and
 camera_center_m for each. Printed are the mean and largest distance of the camera centres after the similarity that
@@ -8,6 +9,8 @@ fits them best, and the mean angle between the rotations, beside the seconds tha
 
 With --turned N every Nth photo is as if it had been held upright: its file says so in EXIF, its pixels stay. What
 is measured there knows nothing of EXIF, and so cameras are turned back for it.
+
+With --contrast C the photos are as if seen through fog: C of their contrast, about FOG grey levels, and noise.
 
 A set with a transforms.json instead, and photos in images/, has no truth but the cameras of another program: how far
 both agree, centres in percent of the largest distance between two of the given ones.
@@ -49,6 +52,7 @@ from stages.sfm.imported.pose_files import read_poses
 
 UPRIGHT_HELD = 6  # EXIF's orientation
 APP1 = b"\xff\xe1"  # the marker of a JPEG's segment with EXIF
+FOG, NOISE = 110.0, 1.0  # grey levels
 
 
 def errors(
@@ -78,6 +82,16 @@ def write_turned(photos: Path, folder: Path, every: int) -> None:
         (folder / photo.name).write_bytes(content)
 
 
+def write_foggy(photos: Path, folder: Path, contrast: float) -> None:
+    """Copy JPEGs with less contrast."""
+    folder.mkdir()
+    random = np.random.default_rng(0)
+    for photo in sorted(photos.rglob("*.jpg")):
+        light = np.asarray(Image.open(photo), np.float32)
+        seen = FOG + contrast * (light - FOG) + random.normal(0, NOISE, light.shape)
+        Image.fromarray(np.rint(seen).clip(0, 255).astype(np.uint8)).save(folder / photo.name, quality=92)
+
+
 def apart(model: SparseModel, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances of the centres and angles (degrees) of the model's images from poses (n, 3, 4) from the camera."""
     found = np.stack([image.sfm_from_camera for image in model.images])
@@ -99,7 +113,7 @@ def agreement(model: SparseModel, transforms: Path, photos: list[Photo]) -> tupl
     return 100 * distances / size, degrees
 
 
-def measure(data: Path, config: sfm.Config, turned: int | None) -> dict[str, Any]:
+def measure(data: Path, config: sfm.Config, turned: int | None, contrast: float | None) -> dict[str, Any]:
     """Run ingest and sfm on one set; its row of the table."""
     transforms = data / "transforms.json"
     with tempfile.TemporaryDirectory() as scratch:
@@ -109,6 +123,9 @@ def measure(data: Path, config: sfm.Config, turned: int | None) -> dict[str, Any
         if turned:
             write_turned(photos, Path(scratch, "turned"), turned)
             photos = Path(scratch, "turned")
+        if contrast:
+            write_foggy(photos, Path(scratch, "foggy"), contrast)
+            photos = Path(scratch, "foggy")
         ingest.run(ingest.Config(photos=photos), {}, folders["ingest"], PlainDisplay())
         begin = time.perf_counter()
         result = run_stage(sfm, config, folders, folders["sfm"], PlainDisplay())
@@ -123,6 +140,7 @@ def measure(data: Path, config: sfm.Config, turned: int | None) -> dict[str, Any
     return {
         "set": data.name,
         **({"turned": turned} if turned else {}),
+        **({"contrast": contrast} if contrast else {}),
         "registered": len(model.images),
         f"centres_{unit}": round(float(off.mean()), 3),
         f"centres_max_{unit}": round(float(off.max()), 3),
@@ -141,13 +159,14 @@ def main() -> None:
     parser.add_argument("--max-features", type=int, default=None)
     parser.add_argument("--max-image-size", type=int, default=None)
     parser.add_argument("--turned", type=int, default=None)
+    parser.add_argument("--contrast", type=float, default=None)
     add_out(parser)
     arguments = parser.parse_args()
     record = Record(arguments.out)
     given = {name: getattr(arguments, name) for name in ("camera_model", "max_features", "max_image_size")}
     config = sfm.Config(**given)
     for name in arguments.sets:
-        record.add(**measure(arguments.data / name, config, arguments.turned))
+        record.add(**measure(arguments.data / name, config, arguments.turned, arguments.contrast))
 
 
 if __name__ == "__main__":
