@@ -49,7 +49,7 @@ def curve_svg(
     rows = [row for row in points if row["seconds"] > 0]
     if len(rows) < 2:
         return None
-    with svg_figure((8.2, 3.4), "curve") as figure:
+    with svg_figure((8.2, 3.8), "curve") as figure:
         axes = figure.add_subplot()
         for key, label, colour in (("train_psnr", "training rays", GREY), ("probe_psnr", "test pixels", BLUE)):
             seen = [(row["seconds"], row[key]) for row in rows if row[key] is not None]
@@ -65,7 +65,7 @@ def curve_svg(
         _draw_baselines(axes, {name: psnr for name, psnr in baselines.items() if psnr is not None})
         _doubling_axis(axes, rows[0]["seconds"], rows[-1]["seconds"], last)
         axes.set(xlabel="training time", ylabel="PSNR (dB)")
-        axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=5, borderaxespad=0)
+        axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderaxespad=0)
         return svg_element(figure)
 
 
