@@ -16,6 +16,7 @@ from stages.ingest.auxiliary_files import Stored
 from stages.ingest.exif import (
     GpsPosition,
     clock_from_exif,
+    digital_zoom,
     exposure_from_exif,
     focal_from_exif,
     gps_from_exif,
@@ -64,6 +65,7 @@ class CameraKey(NamedTuple):
     orientation: int
     focal_mm: float | None
     focal_px: float | None
+    digital_zoom: float = 1.0  # FocalLength is the same at any
 
     def sensor(self) -> "CameraKey":
         """Photos for which this agrees share intrinsics: the same however the camera was held. Mirrored photos share
@@ -339,4 +341,5 @@ def _is_identity(transform: Any, mode: str) -> bool:
 
 def _camera_key(tags: dict[str, Any], width: int, height: int, orientation: int, focal_px: float | None) -> CameraKey:
     make, model, lens = (str(tags.get(tag, "")).strip("\0 ") for tag in ("Make", "Model", "LensModel"))
-    return CameraKey(make, model, lens, width, height, orientation, positive(tags.get("FocalLength")), focal_px)
+    focal_mm, zoom = positive(tags.get("FocalLength")), digital_zoom(tags)
+    return CameraKey(make, model, lens, width, height, orientation, focal_mm, focal_px, zoom)
