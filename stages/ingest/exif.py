@@ -107,12 +107,17 @@ def gps_from_exif(tags: dict[str, Any]) -> GpsPosition:
 
 
 def _degrees(value: Any, direction: Any, positive_negative: str) -> float | None:
-    """(degrees, minutes, seconds) and a letter as signed degrees."""
+    """(degrees, minutes, seconds) and a letter as signed degrees. Seconds may be unreadable, as 0/0 is, where the
+    minutes have a fraction, which stands for them: without one up to a minute, 1.9 km, would be missing."""
     parts = [_number(part) for part in value] if isinstance(value, tuple | list) else []
     sign = {positive_negative[0]: 1, positive_negative[1]: -1}.get(str(direction).strip("\0 ").upper())
-    if len(parts) != 3 or None in parts or sign is None:
+    if len(parts) != 3 or sign is None:
         return None
-    degrees, minutes, seconds = (part for part in parts if part is not None)
+    degrees, minutes, seconds = parts
+    if seconds is None and minutes is not None and not minutes.is_integer():
+        seconds = 0.0
+    if degrees is None or minutes is None or seconds is None:
+        return None
     return sign * (degrees + minutes / 60 + seconds / 3600)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, TiffImagePlugin
 
 from stages.ingest.decoding import decode, upright_size
 from stages.ingest.exif import GpsPosition, clock_from_exif, exposure_from_exif, focal_from_exif, gps_from_exif
@@ -146,6 +146,8 @@ def test_where_a_photo_was_taken(tmp_path: Path, suffix: str) -> None:
         {"GPSLatitude": (91, 0, 0)},
         {"GPSLongitude": (180, 0, 1)},
         {"GPSLatitude": (51, float("nan"), 0)},
+        {"GPSLatitude": (51, 28, TiffImagePlugin.IFDRational(0, 0))},
+        {"GPSLatitude": (51, float("nan"), float("nan"))},
         {"GPSLatitude": (51, 28)},
         {"GPSLatitude": "51.4"},
         {"GPSLatitude": None},
@@ -155,6 +157,12 @@ def test_where_a_photo_was_taken(tmp_path: Path, suffix: str) -> None:
 )
 def test_a_place_that_cannot_be_is_none(wrong: dict[str, object]) -> None:
     assert gps_from_exif(GREENWICH | {"GPSAltitude": 46.0} | wrong) == GpsPosition()
+
+
+@pytest.mark.parametrize("seconds", [TiffImagePlugin.IFDRational(0, 0), float("nan"), None])
+def test_minutes_with_a_fraction_need_no_seconds(seconds: object) -> None:
+    place = gps_from_exif(GREENWICH | {"GPSLatitude": (51, 28 + 38 / 60, seconds)})
+    assert place[:2] == pytest.approx(gps_from_exif(GREENWICH)[:2], abs=1e-9)
 
 
 def test_altitudes_stand_for_themselves() -> None:
