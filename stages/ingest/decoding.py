@@ -25,7 +25,7 @@ from stages.ingest.exif import (
 )
 from stages.ingest.listing import RAW_EXTENSIONS
 from stages.ingest.orientation import QUARTER_TURNS, turned_size, upright
-from stages.ingest.panoramas import is_panorama
+from stages.ingest.panoramas import Panorama, panorama_kind
 from stages.io.files import stand_in
 from stages.io.pixels import pillow
 
@@ -95,7 +95,7 @@ class Decoded:
     suffix: str | None
     stored: Stored
     lossy: bool
-    panorama: bool
+    panorama: Panorama | None
     notes: tuple[str, ...]
 
 
@@ -221,7 +221,7 @@ def _convert(image: Image.Image, stored_plainly: bool, lossy: bool, turned: int 
         suffix=(".png" if image.format == "PNG" else ".jpg") if copy else None,
         stored="black and white" if is_black_and_white(pixels) else _stored(image.mode),
         lossy=lossy,
-        panorama=is_panorama(pixels, image.info.get("xmp")),
+        panorama=panorama_kind(pixels, image.info.get("xmp"), tags.get("CustomRendered")),
         notes=tuple(notes),
     )
 
