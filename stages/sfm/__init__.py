@@ -19,7 +19,7 @@ from stages.io.files import write_json
 from stages.sfm.pairs import MAX_EXHAUSTIVE, Matcher
 
 INPUTS = ("ingest",)
-VERSION = 31
+VERSION = 32
 EXIT_CODE = 11
 RESUMES = True
 PUBLISHED = ("sparse", "registration.json")
