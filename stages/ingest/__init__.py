@@ -18,7 +18,7 @@ from stages.io.files import write_json
 from stages.io.photos import write_photos
 
 INPUTS: tuple[str, ...] = ()
-VERSION = 21
+VERSION = 22
 EXIT_CODE = 10
 RESUMES = False
 NOTES = "notes.json"

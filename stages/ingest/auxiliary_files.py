@@ -20,6 +20,8 @@ _PERHAPS = re.compile(
     r"normal([._-]?maps?)?$|(conf(idence)?|semantics?|segmentations?|instances?|labels?)([._-]?maps?)?($|[._-])",
     re.IGNORECASE,
 )
+# depth_5m/ beside depth_10m/ and surface/ are a diver's.
+_UNDER_WATER = re.compile(r"depths?[._-]?\d+([.,]\d+)?[ ._-]?(m|met(er|re)s?|ft|feet)", re.IGNORECASE)
 _COLOUR = re.compile(r"(.+)[ ._-](colou?r|rgb|image)", re.IGNORECASE)  # a.color.jpg beside a.depth.png
 IGNORED = "dynamic_mask_"  # instant-ngp's masks, beside their photos, whose white is ignored
 # One mask of what all photos show alike: a drone's leg, the rim of a fisheye.
@@ -135,7 +137,9 @@ def is_mask(name: str) -> bool:
 
 def _is_of_maps(folder: PurePosixPath, file: PurePosixPath) -> bool:
     """Whether a folder is by its name one of maps, as far as a file in it can tell."""
-    return bool(_FOLDER.match(folder.name) or (_PERHAPS.match(folder.name) and not _is_jpeg(file)))
+    if _is_jpeg(file) and (_PERHAPS.match(folder.name) or _UNDER_WATER.fullmatch(folder.name)):
+        return False
+    return bool(_FOLDER.match(folder.name) or _PERHAPS.match(folder.name))
 
 
 def _is_jpeg(file: PurePosixPath) -> bool:

@@ -28,7 +28,7 @@ from stages.ingest.exif import GpsPosition
 from stages.ingest.masks import are_of_stored_pixels, read_mask
 from stages.ingest.messages import shown
 from stages.ingest.near_duplicates import Exposure, exposure, near_duplicates, small, thumbnail, well_exposed
-from stages.ingest.panoramas import cutting_advice
+from stages.ingest.panoramas import Panorama, cutting_advice
 from stages.ingest.sharpness import one_colour, relative_sharpness, sharpness
 from stages.ingest.sources import Source
 from stages.ingest.video.frames import take_frames
@@ -219,7 +219,7 @@ def _take(file: Path, name: str, mask: Path | None, stored: bool, waiting: Path)
     try:
         decoded = decode(file)
         if decoded.panorama:
-            raise DecodeError("ingest.panorama", f"a panorama: {cutting_advice('PHOTO', '0.jpg')}")
+            raise _no_photo(decoded.panorama)
         taken_mask = mask and _take_mask(mask, decoded.camera_key, stored, waiting.with_suffix(".mask"))
     except DecodeError as error:
         return Rejection(name, error.code, error.reason)
@@ -252,6 +252,16 @@ def _take(file: Path, name: str, mask: Path | None, stored: bool, waiting: Path)
         opaque=opaque_box(pixels),
         notes=decoded.notes,
     )
+
+
+def _no_photo(kind: Panorama) -> DecodeError:
+    if kind == "swept":  # in no projection that a file tells, and from one place only
+        why = "a panorama of one sweep: take single photos from several places instead"
+        return DecodeError("ingest.swept-panorama", why)
+    advice = cutting_advice("PHOTO", "0.jpg", kind)
+    if kind == "dual fisheye":
+        return DecodeError("ingest.dual-fisheye", f"two fisheye pictures side by side: {advice}")
+    return DecodeError("ingest.panorama", f"a panorama: {advice}")
 
 
 def _take_mask(file: Path, photo: CameraKey, stored: bool, waiting: Path) -> _TakenMask | None:

@@ -5,6 +5,7 @@ wrong becomes a :class:`DecodeError` with a reason a user understands.
 """
 
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ from stages.ingest.auxiliary_files import Stored
 from stages.ingest.exif import (
     GpsPosition,
     clock_from_exif,
+    digital_zoom,
     exposure_from_exif,
     focal_from_exif,
     gps_from_exif,
@@ -24,7 +26,8 @@ from stages.ingest.exif import (
 )
 from stages.ingest.listing import RAW_EXTENSIONS
 from stages.ingest.orientation import QUARTER_TURNS, turned_size, upright
-from stages.ingest.panoramas import is_panorama
+from stages.ingest.panoramas import Panorama, panorama_kind
+from stages.ingest.video.tone_mapping import PHOTO_TRANSFERS, TONE_MAPPED, tone_mapped
 from stages.io.files import stand_in
 from stages.io.pixels import pillow
 
@@ -64,6 +67,7 @@ class CameraKey(NamedTuple):
     orientation: int
     focal_mm: float | None
     focal_px: float | None
+    digital_zoom: float = 1.0  # FocalLength is the same at any
 
     def sensor(self) -> "CameraKey":
         """Photos for which this agrees share intrinsics: the same however the camera was held. Mirrored photos share
@@ -93,7 +97,7 @@ class Decoded:
     suffix: str | None
     stored: Stored
     lossy: bool
-    panorama: bool
+    panorama: Panorama | None
     notes: tuple[str, ...]
 
 
@@ -201,7 +205,7 @@ def _convert(image: Image.Image, stored_plainly: bool, lossy: bool, turned: int 
     """The loaded image as upright sRGB; ``turned`` is the EXIF orientation where it has been undone already."""
     notes: list[str] = []
     tags, orientation = read_exif(image, notes)
-    converted, is_srgb = _to_srgb(_to_eight_bit(image), image.info.get("icc_profile"), notes)
+    converted, is_srgb = _to_srgb(_to_eight_bit(image), image.info, notes)
     pixels = np.asarray(converted if turned else upright(converted, orientation))
     opaque = pixels.shape[2] == 4 and bool((pixels[..., 3] == 255).all())
     pixels = np.ascontiguousarray(pixels[..., :3] if opaque else pixels)
@@ -219,7 +223,7 @@ def _convert(image: Image.Image, stored_plainly: bool, lossy: bool, turned: int 
         suffix=(".png" if image.format == "PNG" else ".jpg") if copy else None,
         stored="black and white" if is_black_and_white(pixels) else _stored(image.mode),
         lossy=lossy,
-        panorama=is_panorama(pixels, image.info.get("xmp")),
+        panorama=panorama_kind(pixels, image.info.get("xmp"), tags.get("CustomRendered")),
         notes=tuple(notes),
     )
 
@@ -310,9 +314,16 @@ def _quantised(image: Image.Image) -> Image.Image:
     return pillow().fromarray(np.rint(values * (255 / limit)).astype(np.uint8))
 
 
-def _to_srgb(image: Image.Image, profile: bytes | None, notes: list[str]) -> tuple[Image.Image, bool]:
-    """``image`` as RGB or RGBA in sRGB, and whether its values already were sRGB."""
-    mode = "RGBA" if image.mode in ("LA", "RGBA") else "RGB"
+def _to_srgb(image: Image.Image, info: Mapping[Any, Any], notes: list[str]) -> tuple[Image.Image, bool]:
+    """``image`` as RGB or RGBA in sRGB, and whether its values already were sRGB, by what its file tells of colours: an
+    ICC profile before HEIF's numbers. Of AVIF Pillow does not tell these."""
+    mode, profile = "RGBA" if image.mode in ("LA", "RGBA") else "RGB", info.get("icc_profile")
+    numbers: Mapping[str, int] = info.get("nclx_profile") or {}
+    if not profile and (transfer := PHOTO_TRANSFERS.get(numbers.get("transfer_characteristics", 0))):
+        notes.append(f"HDR ({transfer}): {TONE_MAPPED}")
+        pixels = np.array(image.convert(mode))
+        pixels[..., :3] = tone_mapped(pixels[..., :3], transfer, numbers["color_primaries"])
+        return pillow().fromarray(pixels), False
     if not profile:
         return image.convert(mode), True
     source = image.convert("RGBA") if image.mode == "LA" else image
@@ -339,4 +350,5 @@ def _is_identity(transform: Any, mode: str) -> bool:
 
 def _camera_key(tags: dict[str, Any], width: int, height: int, orientation: int, focal_px: float | None) -> CameraKey:
     make, model, lens = (str(tags.get(tag, "")).strip("\0 ") for tag in ("Make", "Model", "LensModel"))
-    return CameraKey(make, model, lens, width, height, orientation, positive(tags.get("FocalLength")), focal_px)
+    focal_mm, zoom = positive(tags.get("FocalLength")), digital_zoom(tags)
+    return CameraKey(make, model, lens, width, height, orientation, focal_mm, focal_px, zoom)

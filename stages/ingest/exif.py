@@ -41,7 +41,8 @@ def focal_from_exif(tags: dict[str, Any], width: int, height: int) -> tuple[floa
     The 35 mm equivalent is by the diagonal, as CIPA DCG-001 defines it and COLMAP reads it:
     f_px = f_35 · diagonal_px / 43.27. Otherwise FocalLength with the focal plane resolution, which counts pixels
     as the camera wrote them, so it is scaled to the present width (COLMAP does not). If the recorded pixel
-    dimensions have another aspect the image was cropped and neither says anything.
+    dimensions have another aspect the image was cropped and neither says anything. Digital zoom is in the 35 mm
+    equivalent, as phones write it, and not in FocalLength.
     """
     longer, shorter = max(width, height), min(width, height)
     recorded = positive(tags.get("ExifImageWidth")), positive(tags.get("ExifImageHeight"))
@@ -56,10 +57,16 @@ def focal_from_exif(tags: dict[str, Any], width: int, height: int) -> tuple[floa
     if focal_35 := positive(tags.get("FocalLengthIn35mmFilm")):
         focal, source = focal_35 / 43.27 * math.hypot(width, height), "FocalLengthIn35mmFilm"
     elif focal_mm and resolution and unit_mm:
-        focal, source = focal_mm * resolution / unit_mm * longer / camera_longer, "FocalPlaneXResolution"
+        focal = focal_mm * digital_zoom(tags) * resolution / unit_mm * longer / camera_longer
+        source = "FocalPlaneXResolution"
     if focal is None or not FOCAL_RANGE[0] <= focal / longer <= FOCAL_RANGE[1]:
         return None, None
     return focal, source
+
+
+def digital_zoom(tags: dict[str, Any]) -> float:
+    """By how much the photo was cut and enlarged (EXIF 2.32, tag 0xA404); 1 where that is missing, or 0 for none."""
+    return positive(tags.get("DigitalZoomRatio")) or 1.0
 
 
 def exposure_from_exif(tags: dict[str, Any]) -> float | None:
@@ -100,12 +107,17 @@ def gps_from_exif(tags: dict[str, Any]) -> GpsPosition:
 
 
 def _degrees(value: Any, direction: Any, positive_negative: str) -> float | None:
-    """(degrees, minutes, seconds) and a letter as signed degrees."""
+    """(degrees, minutes, seconds) and a letter as signed degrees. Seconds may be unreadable, as 0/0 is, where the
+    minutes have a fraction, which stands for them: without one up to a minute, 1.9 km, would be missing."""
     parts = [_number(part) for part in value] if isinstance(value, tuple | list) else []
     sign = {positive_negative[0]: 1, positive_negative[1]: -1}.get(str(direction).strip("\0 ").upper())
-    if len(parts) != 3 or None in parts or sign is None:
+    if len(parts) != 3 or sign is None:
         return None
-    degrees, minutes, seconds = (part for part in parts if part is not None)
+    degrees, minutes, seconds = parts
+    if seconds is None and minutes is not None and not minutes.is_integer():
+        seconds = 0.0
+    if degrees is None or minutes is None or seconds is None:
+        return None
     return sign * (degrees + minutes / 60 + seconds / 3600)
 
 

@@ -16,7 +16,8 @@ _NOT_PHOTOS = (
 )
 _PREVIEWS = (".lrv", ".lrf")  # small copies that cameras and drones write beside each video
 _VIDEOS = (
-    ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".mts", ".m2ts", ".wmv", *_PREVIEWS,
+    ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".mts", ".m2ts", ".wmv", ".insv",
+    *_PREVIEWS,
 )
 IMAGES = (
     ".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".insp", ".png", ".heic", ".heif", ".hif", ".tif", ".tiff", ".webp",

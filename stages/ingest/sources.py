@@ -19,6 +19,7 @@ from stages.ingest.listing import (
     FOLDER_HINT,
     IMAGES,
     MASKS,
+    RAW_EXTENSIONS,
     files_below,
     is_photo_folder,
     is_video,
@@ -132,11 +133,17 @@ def _source(photos: Path, cameras: Path | None) -> Source:
     excluded = auxiliary_files(names)
     files = tuple(file for file in files if _name(root, file) not in excluded)
     if cameras is not None and of_llff:
-        rows = {str(row): name for row, name in enumerate(sorted(_name(root, file) for file in files))}
-        return Source("llff", root, cameras, files, rows, excluded=excluded)
+        return Source("llff", root, cameras, files, _rows(root, files), excluded=excluded)
     if cameras is not None:
         return Source("colmap", root, cameras, files, excluded=excluded)
     return Source("photos", root, None, files, excluded=excluded)
+
+
+def _rows(root: Path, files: Sequence[Path]) -> dict[str, str]:
+    """The photo of each row of LLFF's file. Whoever wrote that had pictures by their endings, and not what lies beside
+    them: one file more would shift all rows after it."""
+    pictures = [file for file in files if file.suffix.lower() in IMAGES + RAW_EXTENSIONS]
+    return {str(row): name for row, name in enumerate(sorted(_name(root, file) for file in pictures or files))}
 
 
 def photo_root(folder: Path) -> Path:

@@ -10,6 +10,7 @@ from stages.contract import Inputs, Progress, StageResult
 from stages.io.files import read_json, read_scene, write_json
 from stages.scale.marker_scale import MAX_ERROR, marker_references
 from stages.scale.references import (
+    MAX_GPS_ERROR,
     MAX_STANDARD_ERRORS,
     Reference,
     combined,
@@ -33,7 +34,11 @@ def measure_scale(config: "Config", inputs: Inputs, folder: Path, progress: Prog
     gps = gps_reference(read_json(inputs["sfm"] / "registration.json")["georeference"], scene)
     if gps and used:
         _compare_with_gps(gps, combined(used)[0], progress)
-    used = used or ([gps] if gps else [])
+    elif gps and gps.usable:
+        used = [gps]
+    elif gps:
+        why = f"1 unit = {with_error(gps)}, and the error may be {MAX_GPS_ERROR:.0%} at most"
+        progress.note("scale.gps-inexact", f"GPS is not used for metres: {why}. Give a marker or a distance")
     metres, error = combined(used) if used else (None, None)
     facts = {"metres_per_unit": metres, "relative_error": error, "source": used[0].kind if used else None}
     known = [*references, gps] if gps else references

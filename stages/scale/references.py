@@ -18,6 +18,7 @@ DISTANCE_ERROR = 0.01  # of two points that somebody picked
 READING_ERROR = 0.01  # of lengths read from a ruler or set in a printer: two that differ by less agree
 MAX_STANDARD_ERRORS = 3.0  # between two lengths that agree
 MIN_PRINT_ERROR = 0.001  # of any marker's side
+MAX_GPS_ERROR = 0.25  # two standard errors: with more a volume may be twice what it is said to be, or less than half
 
 
 @dataclass(frozen=True)
@@ -90,13 +91,16 @@ def distance_references(config: "Config") -> Iterator[Reference]:
 
 
 def gps_reference(georeference: dict[str, Any] | None, scene: Scene) -> Reference | None:
-    """What GPS says: its positions' error over how far the photos spread, by the square root of their number."""
+    """What GPS says: its positions' error over how far the photos spread, by the square root of their number. Not to be
+    used where that is above MAX_GPS_ERROR."""
     if georeference is None:
         return None
     metres, photos = georeference["metres_per_unit"], georeference["photos"]
     centres = np.stack([view.scene_from_camera[:, 3] for view in scene.views]) / scene.scene_from_sfm.scale
     spread = metres * math.sqrt(((centres - centres.mean(axis=0)) ** 2).sum(axis=1).mean())
-    return Reference("gps", "GPS", metres, georeference["error_m"] / (spread * math.sqrt(photos)), photos)
+    error = georeference["error_m"] / (spread * math.sqrt(photos))
+    problem = None if 2 * error <= MAX_GPS_ERROR else "gps-inexact"
+    return Reference("gps", "GPS", metres, error, photos, problem)
 
 
 def with_error(reference: Reference) -> str:

@@ -19,7 +19,7 @@ import imageio_ffmpeg
 import numpy as np
 
 from stages.contract import Progress, StageError
-from stages.ingest.panoramas import cutting_advice, is_panorama
+from stages.ingest.panoramas import Panorama, cutting_advice, panorama_kind
 from stages.ingest.sharpness import WIDTH, at_most, sharpness
 from stages.ingest.video.optical_flow import corners, follow_both_ways
 from stages.ingest.video.tone_mapping import srgb_filters
@@ -133,8 +133,8 @@ def _measure(video: Path, progress: Progress) -> list[Frame]:
         announced, stretch = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), _stretch(capture)
         while (answer := capture.read())[0]:
             frame = _with_square_pixels(answer[1], stretch)
-            if not frames and is_panorama(frame):
-                raise _panoramas(video)
+            if not frames and (kind := panorama_kind(frame)):
+                raise _panoramas(video, kind)
             # Grey first: shrinking a large frame takes longer than all the rest, and three times as long in colour.
             grey = at_most(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), WIDTH)
             time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
@@ -286,10 +286,13 @@ def _lost(video: Path, number: int) -> StageError:
     return _undecodable("ingest.frame-lost", video, f"frame {number} cannot be decoded a second time")
 
 
-def _panoramas(video: Path) -> StageError:
-    advice = cutting_advice(video.name, "0.mp4")
-    what, why = f"cannot take photos from {video.name}", "its frames are panoramas"
-    return StageError("ingest.panorama-video", what, why, f"{advice[0].upper()}{advice[1:]}.")
+def _panoramas(video: Path, kind: Panorama) -> StageError:
+    advice = cutting_advice(video.name, "0.mp4", kind)
+    what, hint = f"cannot take photos from {video.name}", f"{advice[0].upper()}{advice[1:]}."
+    if kind == "dual fisheye":
+        why = "its frames are two fisheye pictures side by side"
+        return StageError("ingest.dual-fisheye-video", what, why, hint)
+    return StageError("ingest.panorama-video", what, "its frames are panoramas", hint)
 
 
 def _no_way(video: Path, frames: Sequence[Frame]) -> StageError:

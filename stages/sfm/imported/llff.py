@@ -56,7 +56,8 @@ def read_llff_poses(
         posed.append(posed_photo(photo, photo.name, where, one.camera, pose, upright))
     left_out = without_rays(posed)
     model = SparseModel.without_points(*distinct([one for one in posed if one.file not in left_out]))
-    return ImportedPoses(model, left_out, None, notes_on_photos((), (), posed, left_out))
+    unposed = by_name.keys() - rows.values()  # decoded whatever they are called
+    return ImportedPoses(model, left_out, None, notes_on_photos((), unposed, posed, left_out))
 
 
 def read_llff(file: Path) -> list[LlffCamera]:

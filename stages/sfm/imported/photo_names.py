@@ -3,7 +3,7 @@
 import os
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import takewhile
 from pathlib import PurePosixPath
 from urllib.parse import unquote
@@ -15,7 +15,8 @@ from stages.io.photos import Photo
 def photos_by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
     """Photo by index of its image: of the same name, else of the name that ingest gave it, else of a name whose
     accents are composed in another way, else of the name that it is as a URL, else of the same name below a folder that
-    all have, else of the same end, else of the same name but for its ending, else but for small and capital letters."""
+    all have, else of the same end, else of the same name but for its ending, else but for small and capital letters,
+    else but for these and a folder that all have."""
     found: dict[int, Photo] = {}
     taken: set[str] = set()
     by_own, by_given = {photo.name: photo for photo in photos}, {photo.image_name: photo for photo in photos}
@@ -24,11 +25,12 @@ def photos_by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, P
         by_given,
         _by_key(names, photos, _composed),
         _by_url(names, photos),
-        _by_folder(names, photos),
+        _by_folder(names, photos, _composed),
         _by_end(names, photos),
-        _by_key(names, photos, _without_image_ending),
     )
-    for photo_of in (*candidates, _by_key(names, photos, _without_ending), _by_key(names, photos, _without_case)):
+    keys = (_without_image_ending, _without_ending, _without_case)
+    spelt_otherwise = (find(names, photos, key) for find in (_by_key, _by_folder) for key in keys)
+    for photo_of in (*candidates, *spelt_otherwise):
         for index, name in enumerate(names):
             photo = photo_of.get(name)
             if photo is not None and index not in found and photo.name not in taken:
@@ -37,20 +39,14 @@ def photos_by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, P
     return found
 
 
-def _by_folder(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
+def _by_folder(names: Sequence[str], photos: Sequence[Photo], key: Callable[[str], str]) -> dict[str, Photo]:
     """Photo by name of its image where all images, or else all photos, lie in a folder more: ``images/left/0.jpg`` is
-    ``left/0.jpg``. Of several such folders as few as have a match are left out."""
+    ``left/0.jpg``. Of several such folders as few as have a match are left out. Names are compared by their keys."""
     own = [photo.name for photo in photos]
     of_images = ((_without_folders(names, count), own) for count in range(1, _shared_folders(names) + 1))
     of_photos = ((names, _without_folders(own, count)) for count in range(1, _shared_folders(own) + 1))
-    for images, called in (*of_images, *of_photos):
-        by_name = dict(zip(map(_composed, called), photos, strict=True))
-        found = {
-            n: by_name[key] for n, image in zip(names, images, strict=True) if (key := _composed(image)) in by_name
-        }
-        if found:
-            return found
-    return {}
+    found = (_by_keys(names, map(key, images), photos, map(key, called)) for images, called in (*of_images, *of_photos))
+    return next(filter(None, found), {})
 
 
 def _shared_folders(names: Sequence[str]) -> int:
@@ -83,10 +79,17 @@ def _by_end(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
 
 def _by_key(names: Sequence[str], photos: Sequence[Photo], key: Callable[[str], str]) -> dict[str, Photo]:
     """Photo by name of its image where both names have the same key, and no other image or photo has it."""
-    images = Counter(map(key, names))
-    own = Counter(key(photo.name) for photo in photos)
-    by_key = {key_of: photo for photo in photos if own[key_of := key(photo.name)] == 1}
-    return {name: by_key[key_of] for name in names if images[key_of := key(name)] == 1 and key_of in by_key}
+    return _by_keys(names, map(key, names), photos, (key(photo.name) for photo in photos))
+
+
+def _by_keys(
+    names: Sequence[str], of_images: Iterable[str], photos: Sequence[Photo], of_photos: Iterable[str]
+) -> dict[str, Photo]:
+    """The same for the key of each image and photo."""
+    image_keys, photo_keys = dict(zip(names, of_images, strict=True)), list(of_photos)
+    images, own = Counter(image_keys.values()), Counter(photo_keys)
+    by_key = {key: photo for key, photo in zip(photo_keys, photos, strict=True) if own[key] == 1}
+    return {name: by_key[key] for name, key in image_keys.items() if images[key] == 1 and key in by_key}
 
 
 def _by_url(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:

@@ -41,6 +41,8 @@ from tests.stages.ingest.test_sources import touch
         ("rgb/7.png", "semantic_class/7.png"),
         ("a/7.jpg", "a/Instances/7.tif"),
         ("rgb/7.jpg", "segmentation/7.png"),
+        ("rgb/7.jpg", "depth_5m/7.png"),
+        ("rgb/7.jpg", "depth_5/7.jpg"),
     ],
 )
 def test_a_twin_has_the_name_of_its_photo(photo: str, twin: str) -> None:
@@ -61,6 +63,7 @@ def test_a_twin_has_the_name_of_its_photo(photo: str, twin: str) -> None:
         ("normal_light/1.png", "flash/1.png"),
         ("wide/1.jpg", "normal/1.jpg", "tele/1.jpg", "wide/2.heic", "normal/2.HEIC"),
         ("IMG_1.jpg", "IMG_1_normal.jpg", "IMG_1_bright.jpg"),
+        ("surface/1.jpg", "depth_5m/1.jpg", "Depth-7.5-metres/1.JPG", "depth10ft/1.heic", "1.jpg"),
         ("front/1.jpg", "label/1.jpg", "confirmed/1.png", "instanced/1.png"),
         ("left/1.jpg", "right/1.jpg", "maskenball/1.jpg", "a/left/1.jpg", "b/mask/2.jpg"),
     ],

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, TiffImagePlugin
 
 from stages.ingest.decoding import decode, upright_size
 from stages.ingest.exif import GpsPosition, clock_from_exif, exposure_from_exif, focal_from_exif, gps_from_exif
@@ -62,6 +62,14 @@ def test_focal_from_the_focal_plane_follows_a_resize(unit: int, per_mm: float) -
     assert focal_from_exif(tags | recorded, 750, 1000)[0] == pytest.approx(500)
 
 
+@pytest.mark.parametrize(("told", "zoom"), [(2.0, 2), (1.0, 1), (0, 1), (None, 1), (float("nan"), 1), ("far", 1)])
+def test_digital_zoom_lengthens_focal_lengths_without_it(told: object, zoom: float) -> None:
+    tags = {"FocalLength": 20.0, "FocalPlaneXResolution": 2540.0, "DigitalZoomRatio": told}
+    assert focal_from_exif(tags, 4000, 3000)[0] == pytest.approx(2000 * zoom)
+    equivalent = {"FocalLengthIn35mmFilm": 50}  # of the picture as it is
+    assert focal_from_exif(tags | equivalent, 4000, 3000) == focal_from_exif(equivalent, 4000, 3000)
+
+
 @pytest.mark.parametrize(
     "tags",
     [
@@ -87,6 +95,14 @@ def test_exif_reaches_the_camera_key(tmp_path: Path) -> None:
     assert wide.camera_key[:6] == ("Maker", "M1", "", WIDTH, HEIGHT, 1)
     assert wide.camera_key.focal_px == pytest.approx(28 / 43.27 * np.hypot(WIDTH, HEIGHT))
     assert wide.camera_key != zoomed.camera_key
+
+
+def test_digital_zoom_makes_another_camera(tmp_path: Path) -> None:
+    keys = []
+    for index, told in enumerate((1.0, 0.0, 2.0)):
+        exif = exif_with(Make="Maker", FocalLength=8.0, DigitalZoomRatio=told)
+        keys.append(decode(saved(tmp_path / f"{index}.jpg", Image.fromarray(smooth()), exif=exif)).camera_key)
+    assert keys[0] == keys[1] and keys[2].sensor() == keys[0].sensor()._replace(digital_zoom=2.0)
 
 
 def test_how_a_photo_was_exposed(tmp_path: Path) -> None:
@@ -130,6 +146,8 @@ def test_where_a_photo_was_taken(tmp_path: Path, suffix: str) -> None:
         {"GPSLatitude": (91, 0, 0)},
         {"GPSLongitude": (180, 0, 1)},
         {"GPSLatitude": (51, float("nan"), 0)},
+        {"GPSLatitude": (51, 28, TiffImagePlugin.IFDRational(0, 0))},
+        {"GPSLatitude": (51, float("nan"), float("nan"))},
         {"GPSLatitude": (51, 28)},
         {"GPSLatitude": "51.4"},
         {"GPSLatitude": None},
@@ -139,6 +157,12 @@ def test_where_a_photo_was_taken(tmp_path: Path, suffix: str) -> None:
 )
 def test_a_place_that_cannot_be_is_none(wrong: dict[str, object]) -> None:
     assert gps_from_exif(GREENWICH | {"GPSAltitude": 46.0} | wrong) == GpsPosition()
+
+
+@pytest.mark.parametrize("seconds", [TiffImagePlugin.IFDRational(0, 0), float("nan"), None])
+def test_minutes_with_a_fraction_need_no_seconds(seconds: object) -> None:
+    place = gps_from_exif(GREENWICH | {"GPSLatitude": (51, 28 + 38 / 60, seconds)})
+    assert place[:2] == pytest.approx(gps_from_exif(GREENWICH)[:2], abs=1e-9)
 
 
 def test_altitudes_stand_for_themselves() -> None:

@@ -175,6 +175,17 @@ def test_gps_tells_the_scale_where_nothing_else_does(tmp_path: Path, progress: A
     )
 
 
+def test_inexact_gps_gives_no_metres(tmp_path: Path, progress: Any) -> None:
+    exact = measured(tmp_path / "exact", progress, photos_of((TAG,)), georeference=GPS)
+    limit_m = GPS["error_m"] * 0.25 / (2 * exact["relative_error"])
+    for share, metres in ((0.99, pytest.approx(3.0)), (1.01, None)):
+        georeference = GPS | {"error_m": share * limit_m}
+        told = measured(tmp_path / str(share), progress, photos_of((TAG,)), georeference=georeference)
+        assert told["metres_per_unit"] == metres
+    assert told["source"] is None and told["references"][0]["problem"] == "gps-inexact"
+    assert progress.codes == ["scale.gps-inexact"] and progress.names("scale.gps-inexact", "3 m ± 25 %", "25%")
+
+
 def test_gps_that_contradicts_a_marker_is_named(tmp_path: Path, progress: Any) -> None:
     told = measured(tmp_path, progress, photos_of((TAG,)), georeference=GPS, marker=("tag36h11:3=10cm",))
     assert told["metres_per_unit"] == pytest.approx(units(0.5), rel=0.003)

@@ -9,7 +9,7 @@ from nerf.synthetic.scenes import ring_of_cameras
 from stages.ingest.sources import find_source
 from stages.sfm.imported.llff import read_llff
 from stages.sfm.imported.pose_files import read_poses
-from tests.refusals import refused
+from tests.refusals import codes, refused
 from tests.stages.ingest.test_sources import touch
 from tests.stages.sfm.imported.test_pose_files import H, W, photo
 
@@ -42,6 +42,23 @@ def test_rows_belong_to_photos_in_order_of_their_names(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"x")
     source = find_source(tmp_path, tmp_path / "poses_bounds.npy")
     assert (source.kind, source.frames) == ("llff", {"0": "a10.jpg", "1": "a2.jpg", "2": "b.jpg"})
+
+
+def test_rows_belong_to_pictures_only(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg", "a.jpg.bak", "b.NEF", "notes.xyz", "c.png")
+    np.save(tmp_path / "poses_bounds.npy", rows_of(POSES))
+    source = find_source(tmp_path, tmp_path)
+    assert source.frames == {"0": "a.jpg", "1": "b.NEF", "2": "c.png"} and len(source.files) == 5
+    for file in source.files:
+        file.rename(file.with_name(f"{file.stem}.{file.suffix[1:2]}0"))
+    assert list(find_source(tmp_path, tmp_path).frames.values()) == ["a.j0", "a.jpg.b0", "b.N0", "c.p0", "notes.x0"]
+
+
+def test_photos_without_a_row_are_named(tmp_path: Path) -> None:
+    np.save(tmp_path / "poses_bounds.npy", rows_of(POSES))
+    known = read_poses(tmp_path / "poses_bounds.npy", [*PHOTOS, photo(3)], ROWS)
+    assert len(known.model.images) == 3
+    assert codes(known.notes) == ["sfm.no-camera"] and photo(3).name in known.notes[0].text
 
 
 def test_the_folder_of_the_file_may_be_given(tmp_path: Path) -> None:

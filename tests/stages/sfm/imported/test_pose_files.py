@@ -641,6 +641,9 @@ def test_a_name_that_two_photos_share_matches_neither(tmp_path: Path) -> None:
         (["b/a.png"], ["b/ä.jpg"], {0: "b/ä.jpg"}),
         (["0.jpg", "b/1.JPG", "2"], ["0.png", "b/1.jpg", "2.png"], {0: "0.png", 1: "b/1.jpg", 2: "2.png"}),
         (["b/0.jpg", "1.jpg"], ["0.png", "b/1.png"], {}),  # of another folder as well
+        (["i/0.png", "i/b/1.JPG"], ["0.jpg", "b/1.png"], {0: "0.jpg", 1: "b/1.png"}),  # all in one more
+        (["0.png", "A"], ["i/0.jpg", "i/a.jpg"], {0: "i/0.jpg"}),
+        (["i/A.png", "i/A.png", "i/c.png"], ["a.png", "c.jpg", "c.tif"], {0: "a.png"}),
         (["0.jpg", "1.jpg", "1.jpeg"], ["0.png", "0.tif", "1.png"], {}),
         (["0.jpg", "0.png"], ["0.png"], {1: "0.png"}),
         (["IMG_0.JPG", "B/1.PNG"], ["img_0.jpg", "b/1.png"], {0: "img_0.jpg", 1: "b/1.png"}),
