@@ -93,11 +93,11 @@ def _extract(database: Path, extraction: ExtractionOptions, state: JobState) -> 
 
 
 def _note_few_features(state: JobState, median: float, chosen: ExtractionOptions) -> None:
-    few = f"the photos yield few features (median {median:,.0f}): extracting from photos"
+    few = f"the photos yield few features (median {median:,.0f})"
     if chosen.equalised:
-        note = Note("sfm.contrast-equalised", f"{few} of low contrast, which is raised for that")
+        note = Note("sfm.contrast-equalised", f"{few}: their contrast is low, and is raised for feature extraction")
     else:
-        note = Note("sfm.features-enlarged", f"{few} enlarged to four times the pixels")
+        note = Note("sfm.features-enlarged", f"{few}: extracting from photos enlarged to four times the pixels")
     state.send(note=note)
 
 
