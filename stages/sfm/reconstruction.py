@@ -238,7 +238,7 @@ def _georeference(folder: Path, photos: Sequence[Photo], progress: Progress) -> 
     if isinstance(found, str):
         progress.note("sfm.no-gps-scale", f"the photos' GPS gives no metric scale: {found}")
         return None
-    scale = f"GPS of {found.used} photos gives the scale: one unit is {found.enu_from_sfm.scale:.3g} m"
+    scale = f"by the GPS of {found.used} photos one unit is {found.enu_from_sfm.scale:.3g} m"
     progress.note("sfm.gps-scale", f"{scale}; the median position error is {found.error_m:.1f} m")
     return found.to_json()
 
