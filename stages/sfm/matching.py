@@ -74,7 +74,9 @@ def match_photos(strategy: Strategy, missing: list[int], state: JobState) -> tup
         copy_as_fisheye(latest, database, job.seed)
     else:
         database = state.sibling("more-features")
-        twice = ExtractionOptions(2 * job.max_image_size, 2 * job.max_features, doubled_up_to=job.max_image_size)
+        twice = ExtractionOptions(
+            2 * job.max_image_size, 2 * job.max_features, doubled_up_to=job.max_image_size, equalised=True
+        )
         _extract(database, twice, state)
         graph = _match_all(database, state)
     return database, graph

@@ -173,7 +173,7 @@ class ExtractionOptions(NamedTuple):
         """What to try where these photos yield few features: more pixels, which doubled ones have already, then more
         contrast."""
         larger = [] if all(map(self.doubles, photos)) else [self.larger()]
-        return [*larger, self._replace(equalised=True)]
+        return larger if self.equalised else [*larger, self._replace(equalised=True)]
 
 
 def feature_bytes(photos: Sequence[Photo], extraction: ExtractionOptions) -> float:
