@@ -25,7 +25,7 @@ from stages.io.amounts import duration
 from stages.io.files import read_json, read_scene
 
 INPUTS = ("ingest", "sfm", "normalise")
-VERSION = 18
+VERSION = 19
 EXIT_CODE = 13
 RESUMES = False
 PUBLISHED = ("effects.json",)

@@ -27,6 +27,9 @@ EV = float(np.log(2.0))
 # A gain that is off by d in ln(light) makes an error of VALUE_PER_LOG_LIGHT d in sRGB values: MIN_EFFECT is d = 0.034,
 # 0.05 EV. Called for from twice that, when gains deviate by 0.1 EV.
 THRESHOLD_EV = 2 * MIN_EFFECT / VALUE_PER_LOG_LIGHT / EV
+# Between lamplight and snow in the sun lie 12 EV. Beyond that, gains of photos that show each other's points add up what
+# is no exposure: darker borders along a row of photos, or a lamp that moves with the camera.
+MAX_SPREAD_EV = 12.0
 GEMAN_MCCLURE = 5.0  # in robust deviations: as HUBER loses some 5 % to plain means of normal noise
 HUBER_ROUNDS, MAX_ROUNDS = 8, 30
 CONVERGED = 1e-5  # of a log gain: a tenth of what gains are rounded to where they leave
@@ -168,9 +171,9 @@ def exposure_statistic(
     The noise, that of one usual gain, is beside it; what all gains have is taken off in quadrature, so that noise alone
     is no difference. Photos whose noise is an effect itself do not count, for a few would hide the others' gains, or
     pass for a difference; nor do ``odd`` ones, in which something stands before many of their points
-    (nerf/effects/statistics/outlier_images.py) and draws their gains. ``told`` is what the camera wrote of each photo's
-    exposure (EV up to a constant, NaN where nothing): a cross-check, which decides nothing because programs that
-    develop photos change exposures and leave what was written.
+    (nerf/effects/statistics/outlier_images.py) and draws their gains. Gains farther apart than MAX_SPREAD_EV are no
+    exposures. ``told`` is what the camera wrote of each photo's exposure (EV up to a constant, NaN where nothing): a
+    cross-check, which decides nothing because programs that develop photos change exposures and leave what was written.
     """
     if not fit.known.any():
         return unknown("EV", THRESHOLD_EV, fit.unknown_because, None)
@@ -187,7 +190,10 @@ def exposure_statistic(
     left_out += f"; {_photos(strange)} excluded as outliers" if strange else ""
     left_out += f"; {_photos(unsure)} excluded: gain uncertain by over {THRESHOLD_EV:.1g} EV" if unsure else ""
     checked = "" if told is None else _beside_told(gain.mean(axis=1), told[counted])
-    return classify(spread, noise, THRESHOLD_EV, "EV", f"gains span {span:.2g} EV, {ratio}{left_out}{checked}")
+    found = classify(spread, noise, THRESHOLD_EV, "EV", f"gains span {span:.2g} EV, {ratio}{left_out}{checked}")
+    if np.ptp(np.percentile(gain.mean(axis=1), [5, 95])) > MAX_SPREAD_EV:
+        found = found._replace(called_for=False, words=f"{found.words}; no exposures differ by so much")
+    return found
 
 
 def or_all(some: Bool[np.ndarray, "views"], every: Bool[np.ndarray, "views"]) -> Bool[np.ndarray, "views"]:

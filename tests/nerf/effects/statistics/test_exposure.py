@@ -99,6 +99,17 @@ def test_a_photo_that_is_badly_measured_decides_nothing(deviation_ev: float, cal
         assert unsure.called_for is None and "excluded" not in unsure.words, "better than nothing"
 
 
+@pytest.mark.parametrize(("span_ev", "called_for"), [(11.0, True), (15.0, False)])
+def test_gains_beyond_all_light_are_no_exposures(span_ev: float, called_for: bool) -> None:
+    fit = fit_exposure(photographed_points(0, log_gain=drawn_gains(0, 12, 0.3)))
+    gain = np.repeat(np.linspace(0, span_ev * EV, 12)[:, None], 3, axis=1)
+    found = exposure_statistic(fit._replace(log_gain=gain))
+    assert found.called_for is called_for
+    assert found.words.endswith("no exposures differ by so much") is not called_for
+    gain[:11] = 0  # one photo is not the set
+    assert exposure_statistic(fit._replace(log_gain=gain)).called_for is True
+
+
 def test_exif_exposures_decide_nothing() -> None:
     gain = np.linspace(-0.5, 0.5, 12) * EV
     fit = fit_exposure(photographed_points(3, log_gain=gain))
