@@ -23,8 +23,6 @@ MAX_VOLUME_BYTES = 1 << 29  # a pair of larger images is matched over the five d
 PREFILTER_CAP = 63
 UNIQUENESS_PERCENT = 5  # by which the best cost must beat all but its neighbours: repeated patterns do not
 SPECKLE_PIXELS, SPECKLE_RANGE = 30, 1  # smaller patches that differ by more from what is around them are left out
-CONTRAST_WINDOW, CONTRAST_NOISE = 7, 4.0  # pixels; grey values: less contrast is not stretched
-CONTRAST_SCALE = 42.0  # 3 deviations fill 8 bits
 REFINEMENT_WINDOW = 7
 REFINEMENTS = 2
 MAX_REFINEMENT_PX = 1.0  # beyond it the window shows something else
@@ -37,16 +35,6 @@ MAX_SIGMA_PX = 0.5
 MIN_SIGMA_PX = 0.05  # what resampling, poses and the camera model leave however strong the texture
 UNKNOWN = (float("nan"),)
 MAX_SLOPE = 1.0  # pixels of disparity from one pixel to the next: beyond it there is an edge
-
-
-def even_contrast(pixels: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    """Grey values over their mean and deviation nearby: exposure and vignetting, which differ between photos, go."""
-    window = (CONTRAST_WINDOW, CONTRAST_WINDOW)
-    grey = pixels.astype(np.float32)
-    mean = cv2.blur(grey, window, borderType=cv2.BORDER_REFLECT)
-    variance = np.maximum(cv2.blur(grey * grey, window, borderType=cv2.BORDER_REFLECT) - mean * mean, 0)
-    even = (grey - mean) / np.sqrt(variance + CONTRAST_NOISE**2)
-    return np.clip(np.rint(128 + CONTRAST_SCALE * even), 0, 255).astype(np.uint8)
 
 
 def cost_volume_bytes(pair: Rectified) -> int:

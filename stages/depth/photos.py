@@ -14,14 +14,14 @@ from scipy.sparse import csr_matrix
 from nerf.geometry.scene import Scene, View
 from stages.contract import Inputs, StageError
 from stages.depth.consistency import SparseDepths
-from stages.depth.matching import even_contrast
 from stages.depth.neighbours import Tracks, choose_pairs, depth_range, tracks_of
 from stages.depth.rectification import CannotRectify, Pixels, Rectified, Viewpoint, rectify
 from stages.io.files import read_scene, read_tensors
-from stages.io.pixels import OPAQUE_FROM, load_mask, load_pixels
+from stages.io.pixels import OPAQUE_FROM, even_contrast, load_mask, load_pixels
 from stages.sfm.colmap.cameras import camera_rays
 
 MAX_DISPARITIES = 512  # of a pair: a surface closer than that is not found by it
+CONTRAST_WINDOW, CONTRAST_NOISE = 7, 4.0  # pixels; grey values: less contrast is not stretched
 KEPT_PHOTOS = 48  # in memory, decoded: neighbours mostly follow each other
 
 
@@ -102,7 +102,7 @@ class TrainingPhotos:
         if view.mask is not None:
             used &= load_mask(self.ingest / view.mask, width, height)
         grey = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY)
-        return Pixels(even_contrast(grey), used)
+        return Pixels(even_contrast(grey, CONTRAST_WINDOW, CONTRAST_NOISE), used)
 
     def _colours(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
         width, height = self.viewpoints[number].size

@@ -75,7 +75,7 @@ def match_photos(strategy: Strategy, missing: list[int], state: JobState) -> tup
     else:
         database = state.sibling("more-features")
         twice = ExtractionOptions(
-            2 * job.max_image_size, 2 * job.max_features, doubled_up_to=job.max_image_size, equalised=True
+            2 * job.max_image_size, 2 * job.max_features, doubled_up_to=job.max_image_size, even_contrast=True
         )
         _extract(database, twice, state)
         graph = _match_all(database, state)
@@ -96,8 +96,8 @@ def _extract(database: Path, extraction: ExtractionOptions, state: JobState) -> 
 
 def _note_few_features(state: JobState, median: float, chosen: ExtractionOptions) -> None:
     few = f"the photos yield few features (median {median:,.0f})"
-    if chosen.equalised:
-        note = Note("sfm.contrast-equalised", f"{few}: their contrast is low, and is raised for feature extraction")
+    if chosen.even_contrast:
+        note = Note("sfm.low-contrast", f"{few}: their contrast is low, and is raised for feature extraction")
     else:
         note = Note("sfm.features-enlarged", f"{few}: extracting from photos enlarged to four times the pixels")
     state.send(note=note)

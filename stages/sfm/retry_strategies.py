@@ -76,7 +76,7 @@ STRATEGIES = (
     Strategy("global mapping", "mapping again with global mapping", "same", None),
     Strategy(
         "more features",
-        "extracting twice as many features from photos of twice the size and of equal contrast",
+        "extracting twice as many features from photos of twice the size and of even contrast",
         "more features",
         WEAK_INITIAL_PAIR,
     ),

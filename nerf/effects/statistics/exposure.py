@@ -27,8 +27,8 @@ EV = float(np.log(2.0))
 # A gain that is off by d in ln(light) makes an error of VALUE_PER_LOG_LIGHT d in sRGB values: MIN_EFFECT is d = 0.034,
 # 0.05 EV. Called for from twice that, when gains deviate by 0.1 EV.
 THRESHOLD_EV = 2 * MIN_EFFECT / VALUE_PER_LOG_LIGHT / EV
-# Between lamplight and snow in the sun lie 12 EV. Beyond that, gains of photos that show each other's points add up what
-# is no exposure: darker borders along a row of photos, or a lamp that moves with the camera.
+# Between lamplight and snow in the sun lie 12 EV. Beyond that, gains add up what is no exposure: along a row of photos
+# darker borders, or a lamp that moves with the camera.
 MAX_SPREAD_EV = 12.0
 GEMAN_MCCLURE = 5.0  # in robust deviations: as HUBER loses some 5 % to plain means of normal noise
 HUBER_ROUNDS, MAX_ROUNDS = 8, 30

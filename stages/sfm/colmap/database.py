@@ -17,14 +17,14 @@ from typing import Any, NamedTuple, TypeVar
 import cv2
 import numpy as np
 import pycolmap
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool
 
 from stages.hardware import cluster
 from stages.hardware.device import processors
 from stages.hardware.memory import at_once, available_bytes
 from stages.ingest.orientation import QUARTER_TURNS
 from stages.io.photos import Photo, spread
-from stages.io.pixels import load_pixels
+from stages.io.pixels import even_contrast, load_pixels
 from stages.sfm.colmap.cameras import pixel_map
 from stages.sfm.pairs.feature_matching import IndexedFeatures, index_features, match_descriptors, match_indexed
 from stages.sfm.pairs.image_retrieval import WORDS, Words, photo_similarity, vocabulary
@@ -39,13 +39,10 @@ BLOCK_SIZE = 32  # pairs of photos that are worked on and committed at once (pro
 MAPPING_MODEL = "SIMPLE_RADIAL"  # one focal length and one distortion term hold with few matches
 FISHEYE_MODEL = "SIMPLE_RADIAL_FISHEYE"
 FISHEYE_ANGLE_DEG = 150.0
-# Of the maximum: where the median of so many photos has fewer, photos are enlarged, or their contrast is equalised
+# Of the maximum: where the median of so many photos has fewer, photos are enlarged, or their contrast made even
 # (docs/experiments/few_features.md).
 MIN_FEATURES_SHARE, COUNTED_PHOTOS = 0.25, 12
-# Equalised photos: mean and standard deviation within a Gaussian window, whose own deviation is a share of the longer
-# side; they are taken from a photo of so many pixels. What varies by less than three levels is mostly noise.
-EQUAL_MEAN, EQUAL_DEVIATION, MIN_DEVIATION = 128.0, 40.0, 3.0
-WINDOW, WINDOWED_PIXELS = 0.02, 200
+CONTRAST_WINDOW, CONTRAST_NOISE = 0.06, 3.0  # of the longer side; grey values: less contrast is not stretched
 BYTES_PER_PIXEL = 100  # 77 to 86 measured on photos of 1024 to 3200 pixels
 PHOTOS_AT_A_TIME = 2  # of a cluster's core: to make a database for them takes a twentieth of a second
 OPENINGS, PAUSE_SECONDS = 50, 0.1  # a reader holds the lock for milliseconds
@@ -152,13 +149,13 @@ def _enter_camera(db: pycolmap.Database, camera: pycolmap.Camera) -> None:
 class ExtractionOptions(NamedTuple):
     """How features are extracted: the longer side in pixels that photos are reduced to, the maximum for each photo, the
     folder of masks, up to which longer side photos are doubled first, since smaller ones yield too few features, and
-    whether their contrast is equalised before."""
+    whether their contrast is made even before."""
 
     max_image_size: int
     max_features: int
     masks: Path | None = None
     doubled_up_to: int = 1024
-    equalised: bool = False
+    even_contrast: bool = False
 
     def doubles(self, photo: Photo) -> bool:
         """Whether a photo is doubled before its features are extracted."""
@@ -173,7 +170,7 @@ class ExtractionOptions(NamedTuple):
         """What to try where these photos yield few features: more pixels, which doubled ones have already, then more
         contrast."""
         larger = [] if all(map(self.doubles, photos)) else [self.larger()]
-        return larger if self.equalised else [*larger, self._replace(equalised=True)]
+        return larger if self.even_contrast else [*larger, self._replace(even_contrast=True)]
 
 
 def feature_bytes(photos: Sequence[Photo], extraction: ExtractionOptions) -> float:
@@ -202,7 +199,7 @@ def extract_features(
     much and moves no camera of a well-sized photo (benchmarks/sfm_accuracy.py), so only small ones are doubled. Where
     half of some photos yield few features, as smooth things do, all are enlarged: those of an enlarged photo hardly
     match those of another that is not. Where that is no help, as in fog, under water and in the dark, the contrast of
-    all is equalised: SIFT counts it in absolute grey levels. ``on_few`` is told then what the photos yield as they
+    all is made even: SIFT counts it in absolute grey levels. ``on_few`` is told then what the photos yield as they
     are, and what was chosen.
     """
     with pycolmap.Database.open(database) as db:
@@ -262,7 +259,7 @@ def _extract(
     def here(
         work: Callable[[Sequence[Photo]], list[Extracted]], groups: Iterable[Sequence[Photo]]
     ) -> Iterable[list[Extracted]]:
-        if not turns and not extraction.equalised:
+        if not turns and not extraction.even_contrast:
             _extract_here(database, images, photos, extraction, threads)  # COLMAP writes them itself
             return
         with ThreadPoolExecutor(threads) as pool:
@@ -294,39 +291,23 @@ def _extract_apart(images: Path, extraction: ExtractionOptions, photos: Sequence
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder, "apart.db")
         fill_database(database, photos, MAPPING_MODEL)
-        images = _equalised(images, photos, Path(folder, "images")) if extraction.equalised else images
+        images = _with_even_contrast(images, photos, Path(folder, "images")) if extraction.even_contrast else images
         _extract_here(database, images, photos, extraction, threads=1)
         with pycolmap.Database.open(database) as db:
             numbers = range(1, len(photos) + 1)
             return [(np.array(db.read_keypoints(number)), db.read_descriptors(number)) for number in numbers]
 
 
-def _equalised(images: Path, photos: Sequence[Photo], folder: Path) -> Path:
-    """``folder``, with these photos in grey, their contrast equalised."""
+def _with_even_contrast(images: Path, photos: Sequence[Photo], folder: Path) -> Path:
+    """``folder``, with these photos in grey, of even contrast."""
     for photo in photos:
         pixels = load_pixels(images / photo.image_name, photo.width, photo.height)
-        grey = equalise_contrast(cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY))
+        grey = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY)
+        grey = even_contrast(grey, round(CONTRAST_WINDOW * max(grey.shape)), CONTRAST_NOISE)
         file = folder / photo.image_name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(cv2.imencode(file.suffix, grey, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes())
     return folder
-
-
-def equalise_contrast(grey: UInt8[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
-    """A photo whose mean and standard deviation are EQUAL_MEAN and EQUAL_DEVIATION around every pixel, but where it
-    hardly varies."""
-    height, width = grey.shape
-    scale = WINDOWED_PIXELS / max(height, width)
-    reduced = max(1, round(scale * width)), max(1, round(scale * height))
-    values = grey.astype(np.float32)
-    mean, square = (
-        cv2.GaussianBlur(cv2.resize(of, reduced, interpolation=cv2.INTER_AREA), (0, 0), WINDOW * WINDOWED_PIXELS)
-        for of in (values, values * values)
-    )
-    deviation = np.sqrt(np.maximum(square - mean * mean, MIN_DEVIATION**2))
-    values -= cv2.resize(mean, (width, height))
-    values *= EQUAL_DEVIATION / cv2.resize(deviation, (width, height))
-    return np.clip(np.rint(values + EQUAL_MEAN), 0, 255).astype(np.uint8)
 
 
 def _extract_here(

@@ -4,8 +4,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from stages.io.pixels import CONTRAST_SCALE, even_contrast
 from stages.train.data import training_dataset
 from tests.conftest import RecordedProgress
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
@@ -27,3 +31,19 @@ def test_parallel_decoding_follows_the_files_sizes(
     monkeypatch.setattr("stages.io.pixel_store.ThreadPoolExecutor", pool)
     training_dataset(inputs["ingest"], replace(scene, has_alpha=has_alpha), "train", downscale, progress)
     assert asked == [2]
+
+
+@given(st.floats(0.2, 1.0), st.integers(0, 50), st.integers(0, 2**32))
+def test_even_contrast_is_that_of_any_light(gain: float, offset: int, seed: int) -> None:
+    grey = np.random.default_rng(seed).integers(0, 200, (90, 120), np.uint8)
+    seen = np.rint(offset + gain * grey).astype(np.uint8)
+    difference = even_contrast(seen, 31, 3.0).astype(int) - even_contrast(grey, 31, 3.0)
+    assert (
+        np.abs(difference).max() <= 8
+    )  # of 42 levels a deviation: rounded before, and noise is a part of the faintest
+    assert abs(even_contrast(grey, 31, 3.0).std() - CONTRAST_SCALE) < 3
+
+
+def test_noise_stays_faint_where_contrast_is_even() -> None:
+    noise = np.random.default_rng(0).integers(100, 102, (90, 120)).astype(np.uint8)
+    assert even_contrast(noise, 31, 3.0).std() < CONTRAST_SCALE / 4
