@@ -25,6 +25,10 @@ CONTRAST_WINDOW, CONTRAST_NOISE = 7, 4.0  # pixels; grey values: less contrast i
 KEPT_PHOTOS = 48  # in memory, decoded: neighbours mostly follow each other
 
 
+def _nearby(values: np.ndarray) -> np.ndarray:
+    return cv2.blur(values, (CONTRAST_WINDOW, CONTRAST_WINDOW), borderType=cv2.BORDER_REFLECT)
+
+
 @contextmanager
 def one_thread_each() -> Iterator[None]:
     """OpenCV's own threads are off: pairs and photos are given to the cores instead."""
@@ -102,7 +106,7 @@ class TrainingPhotos:
         if view.mask is not None:
             used &= load_mask(self.ingest / view.mask, width, height)
         grey = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY)
-        return Pixels(even_contrast(grey, CONTRAST_WINDOW, CONTRAST_NOISE), used)
+        return Pixels(even_contrast(grey, _nearby, CONTRAST_NOISE), used)
 
     def _colours(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
         width, height = self.viewpoints[number].size

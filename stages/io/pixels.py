@@ -2,7 +2,7 @@
 
 import logging
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -69,12 +69,14 @@ def load_pixels(path: Path, width: int, height: int) -> np.ndarray:
     return np.rint(np.concatenate([colour, resized[..., 3:]], axis=2)).astype(np.uint8)
 
 
-def even_contrast(pixels: UInt8[np.ndarray, "h w"], window: int, noise: float) -> UInt8[np.ndarray, "h w"]:
-    """Grey values over their mean and deviation nearby, in a square of ``window`` pixels: exposure and vignetting,
-    which differ between photos, go. What varies by less than ``noise`` stays faint."""
-    box, grey = (window, window), pixels.astype(np.float32)
-    mean = cv2.blur(grey, box, borderType=cv2.BORDER_REFLECT)
-    variance = np.maximum(cv2.blur(grey * grey, box, borderType=cv2.BORDER_REFLECT) - mean * mean, 0)
+def even_contrast(
+    pixels: UInt8[np.ndarray, "h w"], nearby: Callable[[np.ndarray], np.ndarray], noise: float
+) -> UInt8[np.ndarray, "h w"]:
+    """Grey values over their mean and deviation, ``nearby`` of each pixel being the mean around it: exposure and
+    vignetting, which differ between photos, go. What varies by less than ``noise`` stays faint."""
+    grey = pixels.astype(np.float32)
+    mean = nearby(grey)
+    variance = np.maximum(nearby(grey * grey) - mean * mean, 0)
     even = (grey - mean) / np.sqrt(variance + noise**2)
     return np.clip(np.rint(128 + CONTRAST_SCALE * even), 0, 255).astype(np.uint8)
 

@@ -42,7 +42,9 @@ FISHEYE_ANGLE_DEG = 150.0
 # Of the maximum: where the median of so many photos has fewer, photos are enlarged, or their contrast made even
 # (docs/experiments/few_features.md).
 MIN_FEATURES_SHARE, COUNTED_PHOTOS = 0.25, 12
-CONTRAST_WINDOW, CONTRAST_NOISE = 0.06, 3.0  # of the longer side; grey values: less contrast is not stretched
+# The deviation of a Gaussian window, a share of the longer side, taken from a photo of so many pixels; and grey values:
+# less contrast is not stretched.
+CONTRAST_WINDOW, WINDOW_PIXELS, CONTRAST_NOISE = 0.02, 200, 2.0
 BYTES_PER_PIXEL = 100  # 77 to 86 measured on photos of 1024 to 3200 pixels
 PHOTOS_AT_A_TIME = 2  # of a cluster's core: to make a database for them takes a twentieth of a second
 OPENINGS, PAUSE_SECONDS = 50, 0.1  # a reader holds the lock for milliseconds
@@ -303,11 +305,20 @@ def _with_even_contrast(images: Path, photos: Sequence[Photo], folder: Path) -> 
     for photo in photos:
         pixels = load_pixels(images / photo.image_name, photo.width, photo.height)
         grey = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY)
-        grey = even_contrast(grey, round(CONTRAST_WINDOW * max(grey.shape)), CONTRAST_NOISE)
+        grey = even_contrast(grey, _nearby, CONTRAST_NOISE)
         file = folder / photo.image_name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(cv2.imencode(file.suffix, grey, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes())
     return folder
+
+
+def _nearby(values: np.ndarray) -> np.ndarray:
+    """The weighted means around the pixels of (h, w) float32."""
+    height, width = values.shape
+    scale = WINDOW_PIXELS / max(height, width)
+    reduced = max(1, round(scale * width)), max(1, round(scale * height))
+    small = cv2.resize(values, reduced, interpolation=cv2.INTER_AREA)
+    return cv2.resize(cv2.GaussianBlur(small, (0, 0), CONTRAST_WINDOW * WINDOW_PIXELS), (width, height))
 
 
 def _extract_here(
