@@ -42,6 +42,9 @@ FISHEYE_ANGLE_DEG = 150.0
 # Of the maximum: where the median of so many photos has fewer, photos are enlarged, or their contrast made even
 # (docs/experiments/few_features.md).
 MIN_FEATURES_SHARE, COUNTED_PHOTOS = 0.25, 12
+MIN_CONTRAST_GAIN = (
+    4.0  # in features, by even contrast: of photos in fog 40 to 200, of a smooth thing 3.6, of others 1.2
+)
 # The deviation of a Gaussian window, a share of the longer side, taken from a photo of so many pixels; and grey values:
 # less contrast is not stretched.
 CONTRAST_WINDOW, WINDOW_PIXELS, CONTRAST_NOISE = 0.02, 200, 2.0
@@ -201,8 +204,8 @@ def extract_features(
     much and moves no camera of a well-sized photo (benchmarks/sfm_accuracy.py), so only small ones are doubled. Where
     half of some photos yield few features, as smooth things do, all are enlarged: those of an enlarged photo hardly
     match those of another that is not. Where that is no help, as in fog, under water and in the dark, the contrast of
-    all is made even: SIFT counts it in absolute grey levels. ``on_few`` is told then what the photos yield as they
-    are, and what was chosen.
+    all is made even if that yields many times more: SIFT counts it in absolute grey levels. ``on_few`` is told then
+    what the photos yield as they are, and what was chosen.
     """
     with pycolmap.Database.open(database) as db:
         todo = [number for number in range(len(photos)) if not db.exists_descriptors(number + 1)]
@@ -220,7 +223,7 @@ def extract_features(
             yielded.append(_median_features(tried, len(some)))
             if yielded[-1] >= few:
                 break
-        best = int(np.argmax(yielded))
+        best = max(range(len(yielded)), key=lambda n: yielded[n] / (MIN_CONTRAST_GAIN if ways[n].even_contrast else 1))
         if best:
             on_few(yielded[0], ways[best])
         _copy_features(Path(folder, f"{best}.db"), database, some)
