@@ -42,9 +42,8 @@ FISHEYE_ANGLE_DEG = 150.0
 # Of the maximum: where the median of so many photos has fewer, photos are enlarged, or their contrast made even
 # (docs/experiments/few_features.md).
 MIN_FEATURES_SHARE, COUNTED_PHOTOS = 0.25, 12
-MIN_CONTRAST_GAIN = (
-    4.0  # in features, by even contrast: of photos in fog 40 to 200, of a smooth thing 3.6, of others 1.2
-)
+# In features, by even contrast: photos in fog have 40 to 200 times as many, a smooth thing 3.6, others 1.2 to 1.4.
+MIN_CONTRAST_GAIN = 4.0
 # The deviation of a Gaussian window, a share of the longer side, taken from a photo of so many pixels; and grey values:
 # less contrast is not stretched.
 CONTRAST_WINDOW, WINDOW_PIXELS, CONTRAST_NOISE = 0.02, 200, 2.0

@@ -17,6 +17,7 @@ from stages.ingest.orientation import QUARTER_TURNS, turned_size, upright
 from stages.io.photos import Photo
 from stages.sfm.colmap.cameras import pixel_map
 from stages.sfm.colmap.database import (
+    MIN_FEATURES_SHARE,
     ExtractionOptions,
     Features,
     extract_features,
@@ -330,6 +331,16 @@ def test_contrast_is_made_even_where_most_photos_are_faint(tmp_path: Path) -> No
             found = np.array(db.read_keypoints(number), float)
             nearest = np.linalg.norm(found[:, None, :2] - there[:, :2], axis=2).min(axis=0)
             assert (nearest < 1.5).mean() > 0.6  # of blobs upon blobs others are found
+
+
+def test_clear_photos_of_few_features_keep_their_contrast(tmp_path: Path) -> None:
+    photos, chosen = pictures(tmp_path, 3, 0), list[tuple[float, ExtractionOptions]]()
+    small = ASKED._replace(max_features=8000, doubled_up_to=480)
+    fill_database(tmp_path / "small.db", photos, "SIMPLE_RADIAL")
+    extract_features(tmp_path / "small.db", tmp_path, photos, small, lambda *few: chosen.append(few))
+    assert chosen == []
+    with pycolmap.Database.open(tmp_path / "small.db") as db:
+        assert 0 < db.num_keypoints_for_image(1) < MIN_FEATURES_SHARE * small.max_features
 
 
 def test_a_cluster_extracts_the_same_features(
