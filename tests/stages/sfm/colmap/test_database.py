@@ -281,7 +281,7 @@ def pictures(folder: Path, busy: int, plain: int) -> list[Photo]:
         for x, y in random.uniform((10, 10), (470, 350), (300, 2)):
             light += contrast * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * sigma**2))
         name = f"{number}.png"
-        Image.fromarray(light.clip(0, 255).astype(np.uint8)).save(folder / name)
+        Image.fromarray(light.clip(0, 255).astype(np.uint8)).convert("RGB").save(folder / name)
         photos.append(Photo(name, f"images/{name}", 480, 360, 0, None, None, False, 1.0))
     return photos
 
@@ -319,8 +319,7 @@ def test_contrast_is_made_even_where_most_photos_are_faint(tmp_path: Path) -> No
     clear = features_of(tmp_path, photos, "clear")
     for photo in photos:  # as through fog: a twentieth of the contrast
         light = np.asarray(Image.open(tmp_path / photo.name), float)
-        faint = Image.fromarray(np.rint(180 + (light - 100) / 20).astype(np.uint8)).convert("RGB")
-        faint.save(tmp_path / photo.name)
+        Image.fromarray(np.rint(180 + (light - 100) / 20).astype(np.uint8)).save(tmp_path / photo.name)
     chosen: list[tuple[float, ExtractionOptions]] = []
     database = tmp_path / "faint.db"
     fill_database(database, photos, "SIMPLE_RADIAL")
