@@ -10,7 +10,7 @@ from stages.contract import StageError
 from stages.hardware import memory
 from stages.hardware.memory import at_once, available_bytes, available_on, check_memory, rooms_in_groups
 from stages.io.photos import Photo
-from stages.sfm.colmap.database import BYTES_PER_PIXEL, ExtractionOptions, feature_bytes
+from stages.sfm.colmap.database import BYTES_PER_PIXEL, EVEN_BYTES_PER_PIXEL, ExtractionOptions, feature_bytes
 
 
 @pytest.fixture
@@ -79,6 +79,13 @@ def test_features_are_searched_on_reduced_or_doubled_photos(size: tuple[int, int
         feature_bytes([Photo("a", "images/a.png", *size, 0, None, None, False, 1.0)], ExtractionOptions(side, 100))
         == BYTES_PER_PIXEL * searched
     )
+
+
+def test_even_contrast_takes_memory_by_the_photos_own_size():
+    photo = Photo("a", "images/a.png", 4000, 3000, 0, None, None, False, 1.0)
+    faint = ExtractionOptions(1000, 100, even_contrast=True)
+    assert feature_bytes([photo], faint) == EVEN_BYTES_PER_PIXEL * 12e6
+    assert feature_bytes([photo], faint._replace(even_contrast=False)) == BYTES_PER_PIXEL * 750_000
 
 
 def test_what_is_free_where_tensors_go(free, monkeypatch: pytest.MonkeyPatch):
