@@ -16,7 +16,7 @@ from stages.scale.lengths import parse_length, parse_point
 from stages.scale.marker_names import parse_marker
 
 INPUTS = ("ingest", "sfm", "normalise")
-VERSION = 3
+VERSION = 4
 EXIT_CODE = 22
 RESUMES = False
 PUBLISHED = ("scale.json",)

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 MAX_ERROR = 0.05  # of a scale that is worth having
 MAX_IRREGULARITY = 0.04  # of a square: one that is cut off, bent or printed out of proportion has no one side
+# Of a square's irregularity, the standard error that it means: the length given is that of one side, and the fitted one
+# lies half-way between the shortest and the longest.
+IRREGULARITY_ERROR = 1 / 3
 MIN_AGREEING = 2 / 3  # of the photos that show a marker, about its place
 MAX_REPEATED = 1 / 3  # of the photos that show a marker, more than once each: these are left out
 
@@ -118,7 +121,7 @@ def _measured(marker: Marker, seen: Sequence[_Sighting], scene: Scene, progress:
         return _unusable(marker, photos, UNCERTAIN, progress)
     if square.irregularity > max(MAX_IRREGULARITY, MAX_STANDARD_ERRORS * error):
         return _unusable(marker, photos, NOT_SQUARE, progress)
-    return _reference(marker, square, error, scene)
+    return _reference(marker, square, max(error, IRREGULARITY_ERROR * square.irregularity), scene)
 
 
 def _sightings(seen: Sequence[_Sighting], scene: Scene) -> Sightings:

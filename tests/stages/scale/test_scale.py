@@ -124,6 +124,13 @@ def test_a_marker_that_is_wrong_is_named(
     assert [one["problem"] for one in told["references"]] == [problem] and progress.codes == [f"scale.{problem}"]
 
 
+@pytest.mark.parametrize("printed", [SEVEN._replace(stretch=1.035), SEVEN._replace(cut=0.035)])
+def test_interval_covers_a_marker_slightly_out_of_proportion(printed: Printed, tmp_path: Path, progress: Any) -> None:
+    told = measured(tmp_path, progress, photos_of((printed,)), marker=("4X4_50:7=80mm",))
+    off = abs(told["metres_per_unit"] / units(0.5) - 1)
+    assert 0.01 < off < 2 * told["relative_error"] < 0.03
+
+
 def test_a_photo_that_shows_a_marker_twice_is_left_out(tmp_path: Path, progress: Any) -> None:
     places, once = photos_of((SEVEN,))
     _, twice = photos_of((SEVEN, SEVEN._replace(centre=(0.16, 0.0))))
