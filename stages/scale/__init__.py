@@ -44,7 +44,7 @@ class Config(StageConfig):
     @classmethod
     def _markers(cls, markers: tuple[str, ...]) -> tuple[str, ...]:
         """Of several lengths of a marker the last counts: a command may correct what the workspace has recorded."""
-        return tuple({parse_marker(marker).name: marker for marker in markers}.values())
+        return tuple({parse_marker(marker).printed: marker for marker in markers}.values())
 
     @field_validator("distance")
     @classmethod

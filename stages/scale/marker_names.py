@@ -30,6 +30,18 @@ class Marker(NamedTuple):
         """As it is given, without the length."""
         return f"{self.dictionary}:{self.number}"
 
+    @property
+    def printed(self) -> str:
+        """The same for all names of a marker: the first fifty of 4X4_1000 are those of 4X4_50."""
+        return printed_name(self.dictionary, self.number)
+
+
+def printed_name(dictionary: str, number: int) -> str:
+    """A marker's name in the smallest dictionary that has it."""
+    family = dictionary.split("_")[0] + "_" if dictionary[0].isdigit() else dictionary
+    alike = (name for name, count in DICTIONARIES.items() if name.startswith(family) and number < count)
+    return f"{next(alike)}:{number}"
+
 
 def parse_marker(text: str) -> Marker:
     """The marker in ``DICTIONARY:ID=LENGTH``; ``tag36h11`` and ``DICT_4X4_50`` are understood too, in any case.

@@ -16,7 +16,7 @@ from stages.contract import run_stage
 from stages.io.files import read_json, write_json, write_png
 from stages.scale.detection import cells_of, find_markers, locate_corners, luminance
 from stages.scale.lengths import length_in_words, parse_length, parse_point
-from stages.scale.marker_names import DICTIONARIES, Marker, parse_marker
+from stages.scale.marker_names import DICTIONARIES, Marker, parse_marker, printed_name
 from stages.scale.square_fit import Sightings, fit_square
 from tests.stages.scale.marker_scene import CAMERA, Printed, photograph_markers, poses, scene_of
 
@@ -205,8 +205,13 @@ def test_without_any_length_the_scale_is_unknown(tmp_path: Path, progress: Any) 
 
 
 def test_dictionaries_are_those_of_opencv() -> None:
-    for name, count in DICTIONARIES.items():
-        assert len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}")).bytesList) == count
+    patterns = {
+        name: cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}")).bytesList for name in DICTIONARIES
+    }
+    assert {name: len(each) for name, each in patterns.items()} == DICTIONARIES
+    for name, each in patterns.items():
+        smallest = [printed_name(name, number).split(":")[0] for number in range(len(each))]
+        assert all((each[number] == patterns[which][number]).all() for number, which in enumerate(smallest))
 
 
 @pytest.mark.parametrize(
@@ -238,6 +243,11 @@ def test_what_cannot_be_meant_is_refused(options: dict[str, Any]) -> None:
 def test_the_last_length_of_a_marker_counts() -> None:
     given = ("4X4_50:7=5cm", "tag36h11:3=2in", "dict_4x4_50:7=6cm")
     assert scale.Config(marker=given).marker == ("dict_4x4_50:7=6cm", "tag36h11:3=2in")
+
+
+def test_a_marker_named_by_two_dictionaries_counts_once() -> None:
+    given = ("4X4_50:7=5cm", "4X4_1000:7=6cm", "5X5_50:7=5cm", "4X4_1000:50=5cm", "4X4_100:50=7cm")
+    assert scale.Config(marker=given).marker == ("4X4_1000:7=6cm", "5X5_50:7=5cm", "4X4_100:50=7cm")
 
 
 def test_lengths_have_units() -> None:
