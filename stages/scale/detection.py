@@ -14,6 +14,7 @@ from jaxtyping import Float, UInt8
 
 from nerf.geometry.scene import Camera
 from nerf.rendering.srgb import linear_light
+from stages.scale.marker_names import DICTIONARIES, printed_name
 from stages.sfm.colmap.cameras import ray_directions
 
 PROFILES = 24  # across each side
@@ -41,6 +42,18 @@ def find_markers(photo: UInt8[np.ndarray, "h w c"], dictionary: str, mirrored: b
         return []
     # OpenCV has the centre of the first pixel at 0.
     return [Found(int(n), c.reshape(4, 2) + 0.5) for n, c in zip(np.ravel(numbers), corners, strict=True)]
+
+
+def printed_markers(photo: UInt8[np.ndarray, "h w c"]) -> set[str]:
+    """Every marker of any dictionary in a photo, by the name it has in the smallest."""
+    largest = [name for name in DICTIONARIES if name.endswith("_1000") or not name[0].isdigit()]
+    detector = cv2.aruco.ArucoDetector([_predefined(name) for name in largest], cv2.aruco.DetectorParameters())
+    grey = cv2.cvtColor(np.ascontiguousarray(photo[..., :3]), cv2.COLOR_RGB2GRAY)
+    _, numbers, _, which = detector.detectMarkersMultiDict(grey)
+    if numbers is None:
+        return set()
+    pairs = zip(np.ravel(which), np.ravel(numbers), strict=True)
+    return {printed_name(largest[int(dictionary)], int(number)) for dictionary, number in pairs}
 
 
 def luminance(photo: UInt8[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w"]:

@@ -1,5 +1,6 @@
 """Metres per unit by printed markers: each is looked for in the photos, and its square fitted to all that show it."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -8,9 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from nerf.geometry.scene import Scene, View
-from stages.contract import Note, Progress
+from stages.contract import Note, Progress, listed
 from stages.io.pixels import load_pixels, loaders
-from stages.scale.detection import cells_of, find_markers, locate_corners, luminance
+from stages.scale.detection import cells_of, find_markers, locate_corners, luminance, printed_markers
 from stages.scale.marker_names import Marker, parse_marker
 from stages.scale.references import MAX_STANDARD_ERRORS, Reference
 from stages.scale.square_fit import Sightings, Square, fit_square
@@ -26,6 +27,8 @@ MAX_IRREGULARITY = 0.04  # of a square: one that is cut off, bent or printed out
 IRREGULARITY_ERROR = 1 / 3
 MIN_AGREEING = 2 / 3  # of the photos that show a marker, about its place
 MAX_REPEATED = 1 / 3  # of the photos that show a marker, more than once each: these are left out
+MAX_PHOTOS_FOR_OTHERS = 40  # looked through for markers that nobody asked for
+MIN_PHOTOS_OF_OTHERS = 3  # that show a marker that nobody asked for: one or two may show what only looks like one
 
 
 def marker_references(config: "Config", scene: Scene, ingest: Path, progress: Progress) -> Iterator[Reference]:
@@ -34,13 +37,13 @@ def marker_references(config: "Config", scene: Scene, ingest: Path, progress: Pr
     if not markers:
         return
     sightings = _search(markers, scene, ingest, progress)
-    mirrored = _mirrored([marker for marker in markers if not sightings[marker]], scene, ingest, progress)
+    missing = [marker for marker in markers if not sightings[marker]]
+    why = _why_missing(missing, markers, scene, ingest, progress)
     for marker in markers:
-        seen = sightings[marker]
-        if not seen:
-            yield _unusable(marker, 0, MIRRORED if marker in mirrored else NOT_FOUND, progress)
+        if marker in why:
+            yield _unusable(marker, 0, why[marker], progress)
         else:
-            yield _measured(marker, seen, scene, progress)
+            yield _measured(marker, sightings[marker], scene, progress)
 
 
 class _Sighting(NamedTuple):
@@ -84,25 +87,33 @@ def _photo(view: View, scene: Scene, ingest: Path) -> np.ndarray:
     return load_pixels(ingest / view.file, camera.width, camera.height)
 
 
-def _mirrored(missing: Sequence[Marker], scene: Scene, ingest: Path, progress: Progress) -> set[Marker]:
-    """Those of some markers whose mirror images are in the photos. These are decoded once more for it: a marker that no
-    photo shows is rare, and looking for mirror images takes as long in every photo as looking for markers."""
+def _why_missing(
+    missing: Sequence[Marker], markers: Sequence[Marker], scene: Scene, ingest: Path, progress: Progress
+) -> dict[Marker, Note]:
+    """Why no photo shows some of the ``markers``: their mirror images are in the photos, or others. The photos are
+    decoded once more for it: a marker that no photo shows is rare, and looking for mirror images takes as long in every
+    photo as looking for markers. Looking for markers of all dictionaries takes eight times as long, and some photos
+    tell."""
     if not missing:
-        return set()
+        return {}
+    some = {view.file for view in scene.views[:: -(-len(scene.views) // MAX_PHOTOS_FOR_OTHERS)]}
 
-    def search(view: View) -> set[Marker]:
-        photo, found = _photo(view, scene, ingest), set[Marker]()
+    def search(view: View) -> tuple[set[Marker], set[str]]:
+        photo, mirrored = _photo(view, scene, ingest), set[Marker]()
         for dictionary in {marker.dictionary for marker in missing}:
             here = {(dictionary, each.number) for each in find_markers(photo, dictionary, mirrored=True)}
-            found |= {marker for marker in missing if (marker.dictionary, marker.number) in here}
-        return found
+            mirrored |= {marker for marker in missing if (marker.dictionary, marker.number) in here}
+        return mirrored, printed_markers(photo) if view.file in some else set()
 
-    found = set[Marker]()
+    mirrored, others = set[Marker](), Counter[str]()
     with ThreadPoolExecutor(loaders(ingest / view.file for view in scene.views)) as pool:
-        for done, here in enumerate(pool.map(search, scene.views)):
-            found |= here
-            progress.update("mirror images of markers in the photos", done / len(scene.views))
-    return found
+        for done, (mirrored_here, others_here) in enumerate(pool.map(search, scene.views)):
+            mirrored |= mirrored_here
+            others.update(others_here - {marker.printed for marker in markers})
+            progress.update("other markers in the photos", done / len(scene.views))
+    shown = [name for name, photos in others.most_common() if photos >= MIN_PHOTOS_OF_OTHERS]
+    otherwise = _others_shown(shown) if shown else NOT_FOUND
+    return {marker: MIRRORED if marker in mirrored else otherwise for marker in missing}
 
 
 def _measured(marker: Marker, seen: Sequence[_Sighting], scene: Scene, progress: Progress) -> Reference:
@@ -157,6 +168,11 @@ UNCERTAIN = Note(
     "scale.uncertain", f"its side is known to no better than {MAX_ERROR:.0%}: show it larger, and from more places"
 )
 NOT_SQUARE = Note("scale.not-square", "its four sides differ: it is cut off, bent, or printed out of proportion")
+
+
+def _others_shown(names: Sequence[str]) -> Note:
+    text = f"no photo shows it, but photos show {listed(names, 5)}: give the dictionary and the number that you printed"
+    return Note("scale.other-markers", text)
 
 
 def _unusable(marker: Marker, photos: int, problem: Note, progress: Progress) -> Reference:

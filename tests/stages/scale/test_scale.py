@@ -109,7 +109,8 @@ def test_edges_are_half_way_in_linear_light_not_in_srgb() -> None:
 @pytest.mark.parametrize(
     ("printed", "problem"),
     [
-        ((TAG,), "not-found"),
+        ((), "not-found"),
+        ((TAG,), "other-markers"),
         ((SEVEN._replace(mirrored=True),), "mirrored"),
         ((SEVEN, SEVEN._replace(centre=(0.16, 0.0))), "repeated"),
         ((SEVEN._replace(stretch=1.1),), "not-square"),
@@ -129,6 +130,14 @@ def test_interval_covers_a_marker_slightly_out_of_proportion(printed: Printed, t
     told = measured(tmp_path, progress, photos_of((printed,)), marker=("4X4_50:7=80mm",))
     off = abs(told["metres_per_unit"] / units(0.5) - 1)
     assert 0.01 < off < 2 * told["relative_error"] < 0.03
+
+
+def test_markers_shown_instead_of_the_one_given_are_named(tmp_path: Path, progress: Any) -> None:
+    measured(tmp_path, progress, photos_of((SEVEN, TAG)), marker=("5X5_50:7=80mm", "4X4_100:7=8cm"))
+    assert progress.codes == ["scale.other-markers"] and progress.names("scale.other-markers", "APRILTAG_36h11:3:")
+    progress.clear()
+    measured(tmp_path / "both", progress, photos_of((SEVEN, TAG)), marker=("4X4_50:8=80mm",))
+    assert progress.names("scale.other-markers", "4X4_50:7", "APRILTAG_36h11:3")
 
 
 def test_a_photo_that_shows_a_marker_twice_is_left_out(tmp_path: Path, progress: Any) -> None:
