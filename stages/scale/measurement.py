@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stages.contract import Inputs, Progress, StageResult
-from stages.io.files import read_json, read_scene, write_json
+from stages.io.files import read_json, read_scene, read_tensors, write_json
 from stages.scale.marker_scale import MAX_ERROR, marker_references
 from stages.scale.references import (
     MAX_GPS_ERROR,
@@ -28,7 +28,11 @@ if TYPE_CHECKING:
 def measure_scale(config: "Config", inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """The stage's work: look for the markers, weigh all references, write scale.json."""
     scene = read_scene(inputs["normalise"])
-    references = [*marker_references(config, scene, inputs["ingest"], progress), *distance_references(config)]
+    sparse = read_tensors(inputs["normalise"] / "points.safetensors")["xyz"]
+    references = [
+        *marker_references(config, scene, inputs["ingest"], progress),
+        *distance_references(config, scene, sparse, progress),
+    ]
     references = without_contradictions(references, progress)
     used = [reference for reference in references if reference.usable]
     gps = gps_reference(read_json(inputs["sfm"] / "registration.json")["georeference"], scene)

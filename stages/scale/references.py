@@ -6,15 +6,18 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 
 from nerf.geometry.scene import Scene
-from stages.contract import Progress, listed
+from stages.contract import Note, Progress, listed
 from stages.scale.lengths import length_in_words, parse_length, parse_point
 
 if TYPE_CHECKING:
     from stages.scale import Config
 
 DISTANCE_ERROR = 0.01  # of two points that somebody picked
+MAX_REACH = 2.0  # of such a point from the origin of the scene, in that of the farthest camera or sparse point
+MIN_DISTANCE = 0.002  # of two such points, in scene units: a thousandth of the region's side; nobody picks to 1 % of it
 READING_ERROR = 0.01  # of lengths read from a ruler or set in a printer: two that differ by less agree
 MAX_STANDARD_ERRORS = 3.0  # between two lengths that agree
 MIN_PRINT_ERROR = 0.001  # of any marker's side
@@ -82,12 +85,34 @@ def _agree(one: Reference, other: Reference) -> bool:
     )
 
 
-def distance_references(config: "Config") -> Iterator[Reference]:
-    """What the distance between two given points says, where one is given."""
-    if config.distance is not None:
-        start, end, length = config.distance
+def distance_references(
+    config: "Config", scene: Scene, sparse: Float[np.ndarray, "n 3"], progress: Progress
+) -> Iterator[Reference]:
+    """What the distance between two given points says, where one is given; ``sparse`` points are in the scene frame."""
+    if config.distance is None:
+        return
+    start, end, length = config.distance
+    problem = _why_nobody_picked(start, end, scene, sparse)
+    if problem is None:
         units = math.dist(parse_point(start), parse_point(end))
         yield Reference("distance", "the distance", parse_length(length) / units, DISTANCE_ERROR)
+    else:
+        progress.note(*problem._replace(text=f"the distance is not used: {problem.text}"))
+        yield Reference("distance", "the distance", problem=problem.code.removeprefix("scale."))
+
+
+def _why_nobody_picked(start: str, end: str, scene: Scene, sparse: Float[np.ndarray, "n 3"]) -> Note | None:
+    """Why nobody can have picked two points in a mesh or point cloud of the scene."""
+    centres = [view.scene_from_camera[:, 3] for view in scene.views]
+    reach = MAX_REACH * max(1.0, float(np.linalg.norm([*centres, *sparse], axis=1).max()))
+    points = {text: scene.scene_from_sfm.points(np.array(parse_point(text))) for text in (start, end)}
+    outside = " and ".join(text for text, point in points.items() if not math.hypot(*point) <= reach)
+    if outside:
+        where = f"{outside} lies far from all that the photos show"
+        return Note("scale.point-outside", f"{where}: give points in the frame of output/transforms.json")
+    if math.dist(*points.values()) < MIN_DISTANCE:
+        return Note("scale.points-too-near", "its points lie too near each other: give points that lie farther apart")
+    return None
 
 
 def gps_reference(georeference: dict[str, Any] | None, scene: Scene) -> Reference | None:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from nerf.geometry.scene import Similarity
 from stages import scale
 from stages.contract import run_stage
-from stages.io.files import read_json, write_json, write_png
+from stages.io.files import read_json, write_json, write_png, write_tensors
 from stages.scale.detection import cells_of, find_markers, locate_corners, luminance
 from stages.scale.lengths import length_in_words, parse_length, parse_point
 from stages.scale.marker_names import DICTIONARIES, Marker, parse_marker, printed_name
@@ -50,6 +50,7 @@ def measured(
         (folder / name).mkdir()
     write_json(inputs["sfm"] / "registration.json", {"georeference": georeference})
     write_json(inputs["normalise"] / "scene.json", scene_of(places, SCENE_FROM_SFM, files).to_json())
+    write_tensors(inputs["normalise"] / "points.safetensors", {"xyz": np.zeros((0, 3), np.float32)})
     run_stage(scale, scale.Config(**config), inputs, folder / "out", progress)
     return read_json(folder / "out/scale.json")
 
@@ -179,6 +180,24 @@ def test_a_distance_decides_between_markers_that_disagree(tmp_path: Path, progre
     assert [one["problem"] for one in told["references"]] == [None, "disagrees", None]
     assert told["metres_per_unit"] == pytest.approx(units(0.5), rel=0.003)
     assert progress.codes == ["scale.contradiction"]
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "problem"),
+    [
+        ("0,0,0", "1,0,0", None),
+        ("0,0,0", "0.0049,0,0", "points-too-near"),
+        ("0,0,0", "1e-320,0,0", "points-too-near"),
+        ("110,420,1900", "350,400,1880", "point-outside"),
+        ("1e308,0,0", "-1e308,0,0", "point-outside"),
+    ],
+)
+def test_points_that_nobody_can_have_picked_are_named(
+    start: str, end: str, problem: str | None, tmp_path: Path, progress: Any
+) -> None:
+    told = measured(tmp_path, progress, photos_of((TAG,)), distance=(start, end, "25cm"))
+    assert told["metres_per_unit"] == (None if problem else 0.25) and told["references"][0]["problem"] == problem
+    assert progress.codes == ([f"scale.{problem}"] if problem else [])
 
 
 GPS = {"metres_per_unit": 3.0, "error_m": 0.05, "photos": PHOTOS}
