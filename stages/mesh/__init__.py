@@ -18,7 +18,7 @@ from stages.scale import metres_per_unit
 from stages.train import trained_seconds
 
 INPUTS = ("ingest", "normalise", "scale", "train")
-VERSION = 20
+VERSION = 21
 EXIT_CODE = 17
 RESUMES = False
 PUBLISHED = ("mesh.glb", "mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "mesh.stl", "mesh.3mf")

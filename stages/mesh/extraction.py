@@ -35,7 +35,7 @@ from stages.mesh.photos.refinement import Refined, refine
 from stages.mesh.photos.sightings import Sightings, find_sightings
 from stages.mesh.preview import preview, small_copy
 from stages.mesh.resolution import CHUNK, grid_box, point_cost, slab_factor
-from stages.mesh.surface import Surface, face_areas, is_watertight, keep_faces, vertex_normals
+from stages.mesh.surface import Surface, components, face_areas, is_watertight, keep_faces, vertex_normals
 from stages.mesh.surface.decimation import decimate
 from stages.mesh.surface.holes import Closed, close_holes
 from stages.mesh.texture.texturing import Textured, texture_of
@@ -80,10 +80,12 @@ class Source(NamedTuple):
 
 
 class Extracted(NamedTuple):
-    """``mesh`` in the scene frame, how it came about, what was ``refined`` and ``closed``, ``boundary``: where it ends,
-    and the texture with what is known of it. ``voxel`` is in scene units, the median over the vertices."""
+    """``mesh`` in the scene frame with the number of its ``components``, how it came about, what was ``refined`` and
+    ``closed``, ``boundary``: where it ends, and the texture with what is known of it. ``voxel`` is in scene units, the
+    median over the vertices."""
 
     mesh: ColouredMesh
+    components: int
     iso_level: IsoLevel
     cleaned: Cleaned
     refined: Refined | None
@@ -142,7 +144,8 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     textured = _textured(config, surface, colours, sightings, progress)
     mesh = ColouredMesh(*surface, vertex_normals(surface), colours, textured and textured.texture)
     voxel = float(np.median(voxel_size.at(surface.vertices).along))
-    return Extracted(mesh, iso_level, cleaned, refined, closed, ends, voxel, textured)
+    parts = int(components(surface).max()) + 1
+    return Extracted(mesh, parts, iso_level, cleaned, refined, closed, ends, voxel, textured)
 
 
 def default_faces(config: "Config", found: int) -> int:
@@ -284,11 +287,11 @@ def vertex_colours(
 def save(config: "Config", extracted: Extracted, source: Source, folder: Path) -> StageResult:
     """Write the files; the summary line and the facts for the report."""
     outputs = write_mesh(config, extracted.mesh, source, folder)
-    faces, components = len(extracted.mesh.faces), extracted.cleaned.kept
+    faces = len(extracted.mesh.faces)
     count = f"{faces / 1000:.0f} k faces" if faces >= 10_000 else f"{faces} faces"
     if (texture := extracted.mesh.texture) is not None:
         count += f", texture {texture.atlas.width} × {texture.atlas.height}"
-    line = f"{count}, {components} component{'s' * (components > 1)}, {extracted.boundary}"
+    line = f"{count}, {extracted.components} component{'s' * (extracted.components > 1)}, {extracted.boundary}"
     if extracted.closed.holes:
         line += f", {extracted.closed.area_share:.1%} of the area invented"
     if not extracted.iso_level.well_defined:
@@ -331,7 +334,7 @@ def _facts(config: "Config", extracted: Extracted, source: Source) -> dict[str, 
             "faces": len(mesh.faces),
             "watertight": extracted.boundary == "watertight",
             "boundary": extracted.boundary,
-            "components_kept": cleaned.kept,
+            "components_kept": extracted.components,
             "components_dropped": cleaned.dropped,
             "faces_outside_photos": cleaned.outside,
             "faces_hidden": cleaned.hidden,

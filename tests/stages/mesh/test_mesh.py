@@ -76,6 +76,10 @@ def plain(points):
     return points[..., 2] + 0.2
 
 
+def plain_with_ditch(points):
+    return points[..., 2] + 0.2 + 0.6 * (points[..., 0].abs() < 0.2)
+
+
 def scene_around(count=12):
     views = []
     for number in range(count):
@@ -349,6 +353,16 @@ def test_faces_outside_of_the_box_are_left_out(run_mesh):
     assert result.facts["watertight"] is False
     with refused("mesh.nothing-in-box", "0.4"):
         run_mesh(Solid(ball), folder="beside", box=(0.8, 0.8, 0.8, 0.9, 0.9, 0.9), frame="scene")
+
+
+def test_components_are_those_of_the_files(run_mesh):
+    """Not those before the box cut one away, or one into two."""
+    lower, wall = (-1.0, -1.0, -1.0, 1.0, 1.0, 0.0), (-1.0, -1.0, -0.4, 1.0, 1.0, 0.4)
+    for model, box, number in ((two_balls, lower, 1), (plain_with_ditch, wall, 2)):
+        result, folder = run_mesh(Solid(model), folder=f"{number}", keep="all", box=box, frame="scene")
+        loaded = trimesh.load_mesh(folder / "mesh.ply", process=False)
+        assert loaded.body_count == number == result.facts["components_kept"]
+        assert f"{number} component" in result.line
 
 
 def test_closing_says_how_much_is_invented(run_mesh):
