@@ -127,7 +127,7 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
         raw, visibility, source.points, config.keep, min_views, config.min_component, source.scene.has_alpha
     )
     cropped = _cropped(config, cleaned.surface, source)
-    surface = decimate(cropped, config.max_faces or default_faces(config, len(cropped.faces)), source.space)
+    surface = _decimated(config, cropped, source.space)
     ends = boundary(surface, extent, voxel_size, cropped=len(cropped.faces) < len(cleaned.surface.faces))
     surface, refined, sightings = _refined(config, surface, source, voxel_size, progress)
     if config.close:
@@ -137,6 +137,12 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
             sightings = _sightings(surface, source, voxel_size, progress, 0.65)
     else:
         closed = Closed(0, 0, 0.0)
+    if config.max_faces is not None and len(surface.faces) > config.max_faces:
+        progress.note(
+            "mesh.more-faces",
+            f"{len(surface.faces)} faces are left, more than --mesh.max-faces {config.max_faces}: decimation leaves "
+            "open borders as they are, and closing holes adds faces",
+        )
     progress.update("colours", 0.7)
     nearest = KDTree(cleaned.surface.vertices).query(surface.vertices)[1]
     directions, of_raw = visibility.direction[cleaned.vertex[nearest]], cleaned.surface.vertices[nearest]
@@ -146,6 +152,20 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     voxel = float(np.median(voxel_size.at(surface.vertices).along))
     parts = int(components(surface).max()) + 1
     return Extracted(mesh, parts, iso_level, cleaned, refined, closed, ends, voxel, textured)
+
+
+def _decimated(config: "Config", surface: Surface, space: SpaceMap) -> Surface:
+    """The surface with as many faces as asked for, more where it has many open borders."""
+    most = config.max_faces or default_faces(config, len(surface.faces))
+    decimated = decimate(surface, most, space)
+    if not len(decimated.faces):
+        raise StageError(
+            "mesh.decimated-away",
+            f"--mesh.max-faces {most} leaves nothing of the mesh",
+            f"it has {int(components(surface).max()) + 1} components, and each takes at least 4 faces",
+            "Try more --mesh.max-faces, or --mesh.keep largest.",
+        )
+    return decimated
 
 
 def default_faces(config: "Config", found: int) -> int:

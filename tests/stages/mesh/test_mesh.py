@@ -289,6 +289,27 @@ def test_decimation_leaves_as_many_faces_as_asked_for(run_mesh):
     assert result.line == "1000 faces, 1 component, watertight"
 
 
+def test_more_faces_than_asked_for_are_told(run_mesh, progress):
+    """Borders stay in decimation, and closing them comes after it."""
+    half = {"box": (-1.0, -1.0, 0.0, 1.0, 1.0, 1.0), "frame": "scene", "max_faces": 120}
+    run_mesh(Solid(ball), max_faces=120)
+    assert "mesh.more-faces" not in progress.codes
+    for close in (0.0, 1.0):
+        result, _ = run_mesh(Solid(ball), folder=f"{close}", close=close, **half)
+        assert result.facts["faces"] > 120 and progress.names("mesh.more-faces", result.facts["faces"], 120)
+        progress.clear()
+
+
+def crumbs(points):
+    """Balls on a cubic lattice, five along each axis, none at the edge of the region."""
+    return (points - 0.3 * (points / 0.3).round().clamp(-2, 2)).norm(dim=-1) - 0.08
+
+
+def test_a_mesh_that_decimation_would_remove_is_refused(run_mesh):
+    with refused("mesh.decimated-away", "--mesh.max-faces 100", "125 components"):
+        run_mesh(Solid(crumbs), keep="all", max_faces=100)
+
+
 @pytest.mark.parametrize(
     ("model", "settings", "code"),
     [
