@@ -9,7 +9,7 @@ A surface that leaves the region of interest ends there, open: closing it would 
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from stages.contract import Auto, Flexible, Inputs, Progress, StageConfig, StageError, StageResult, Workload
 from stages.hardware.device import processors
@@ -35,6 +35,7 @@ MIN_SHARE_OF_SHAPE = 0.3  # of a time limit, that refinement and texture leave
 
 Format = Literal["glb", "ply", "obj", "stl", "3mf"]
 Keep = Literal["visible", "largest", "all"]
+Box = tuple[float, float, float, float, float, float]
 
 
 class Config(StageConfig):
@@ -59,7 +60,7 @@ class Config(StageConfig):
     min_component: float = Field(
         default=0.01, ge=0, le=1, description="Area of the smallest component kept, as a fraction of the largest one's."
     )
-    box: Auto[tuple[float, float, float, float, float, float]] = Field(
+    box: Auto[Box] = Field(
         default=None,
         description=(
             "Keep only what lies in this box: its lowest x, y, z and its highest, in the frame of the files "
@@ -101,6 +102,13 @@ class Config(StageConfig):
             "else sfm)."
         ),
     )
+
+    @field_validator("box")
+    @classmethod
+    def _box(cls, box: Box | None) -> Box | None:
+        if box is not None and not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
+            raise ValueError("give the lowest x, y, z first, then the highest")
+        return box
 
 
 def expected_seconds(config: Config, workload: Workload) -> float | None:

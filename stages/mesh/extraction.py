@@ -126,7 +126,7 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     cleaned = clean(
         raw, visibility, source.points, config.keep, min_views, config.min_component, source.scene.has_alpha
     )
-    cropped = _cropped(config, cleaned.surface, source)
+    cropped = _cropped(config, cleaned.surface, source, progress)
     surface = _decimated(config, cropped, source.space)
     ends = boundary(surface, extent, voxel_size, cropped=len(cropped.faces) < len(cleaned.surface.faces))
     surface, refined, sightings = _refined(config, surface, source, voxel_size, progress)
@@ -174,8 +174,9 @@ def default_faces(config: "Config", found: int) -> int:
     return MAX_FACES if config.texture_size == 0 else min(MAX_FACES, max(MIN_FACES, round(FACES_KEPT * found)))
 
 
-def _cropped(config: "Config", surface: Surface, source: Source) -> Surface:
-    """The faces that lie in the box asked for."""
+def _cropped(config: "Config", surface: Surface, source: Source, progress: Progress) -> Surface:
+    """The faces that lie in the box asked for. In which frame is told: once a length is given the files are in metres,
+    and so is the box."""
     if config.box is None:
         return surface
     vertices = source.files_from_scene(config.frame).points(surface.vertices)
@@ -188,6 +189,8 @@ def _cropped(config: "Config", surface: Surface, source: Source) -> Surface:
         raise StageError(
             "mesh.nothing-in-box", "no face of the mesh lies in --mesh.box", why, "Give a box within that."
         )
+    unit = "metres" if config.frame == "metric" else f"units of the {config.frame} frame"
+    progress.note("mesh.cropped", f"{inside.mean():.0%} of the faces lie in --mesh.box, which is in {unit}")
     return keep_faces(surface, inside)[0]
 
 

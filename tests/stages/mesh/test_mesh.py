@@ -376,6 +376,26 @@ def test_faces_outside_of_the_box_are_left_out(run_mesh):
         run_mesh(Solid(ball), folder="beside", box=(0.8, 0.8, 0.8, 0.9, 0.9, 0.9), frame="scene")
 
 
+def test_the_frame_of_the_box_is_told(run_mesh, progress):
+    """The same numbers mean another box once the scale is known."""
+    below_the_middle, areas, shares = (-3.0, -3.0, -3.0, 3.0, 3.0, -0.4), [], []
+    for metres, unit in ((None, "units of the sfm frame"), (0.5, "metres")):
+        result, _ = run_mesh(Solid(ball), folder=unit, box=below_the_middle, metres=metres)
+        (told,) = progress.said("mesh.cropped")
+        assert told.endswith(unit)
+        areas.append(result.facts["surface_area"] / (metres or 1.0) ** 2)
+        shares.append(float(told.partition("%")[0]))
+        progress.clear()
+    assert 45 < shares[0] < 52 and 20 < shares[1] < 40
+    assert areas[1] / areas[0] == pytest.approx(shares[1] / shares[0], rel=0.05)
+
+
+@pytest.mark.parametrize("box", [(1, 1, 1, 0, 0, 0), (0, 0, 0, 1, 1, 0), (0, 2, 0, 1, 1, 1)])
+def test_a_box_without_inside_is_refused(box):
+    with pytest.raises(ValueError, match="lowest"):
+        mesh.Config(box=box)
+
+
 def test_components_are_those_of_the_files(run_mesh):
     """Not those before the box cut one away, or one into two."""
     lower, wall = (-1.0, -1.0, -1.0, 1.0, 1.0, 0.0), (-1.0, -1.0, -0.4, 1.0, 1.0, 0.4)
