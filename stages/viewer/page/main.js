@@ -14,6 +14,7 @@ class Viewer {
     this.overlay = new Overlay(contents);
     this.renderer = new Renderer(canvas, contents, () => this.request(), (request, target) => this.drawOver(request, target));
     this.overlay.restore(this.renderer.graphics);
+    this.homeDistance = this.navigation.distance = this.distanceAhead(); // also where a link leads elsewhere
     this.readLink();
     this.panels = new Panels(this);
     canvas.addEventListener("webglcontextlost", (event) => {
@@ -27,8 +28,6 @@ class Viewer {
     });
     canvas.addEventListener("dblclick", (event) => this.orbitAround(event));
     window.addEventListener("hashchange", () => this.readLink());
-    if (!this.linked) this.navigation.distance = this.distanceAhead();
-    this.homeDistance = this.navigation.distance;
     requestAnimationFrame((time) => this.frame(time, time));
   }
 
@@ -217,13 +216,13 @@ class Viewer {
   }
 
   readLink() {
-    const values = new URLSearchParams(location.hash.slice(1)), numbers = (name) => (values.get(name) ?? "").split(",").map(Number);
+    const values = new URLSearchParams(location.hash.slice(1)), numbers = (name) => (values.get(name) ?? "").split(",").map(parseFloat);
     const [centre, turn, [distance]] = [numbers("c"), numbers("q"), numbers("d")];
     const isWhole = centre.length === 3 && turn.length === 4 && [...centre, ...turn, distance].every(Number.isFinite);
     if (!isWhole || !(norm(turn) > 0) || !(distance > 0)) return;
-    this.linked = true;
     this.navigation.distance = distance;
-    if (values.get("v") in VIEWS) this.view = values.get("v");
+    const choices = [...document.getElementsByName("view")].map((input) => input.value);
+    if (choices.includes(values.get("v"))) this.view = values.get("v");
     this.navigation.moveTo({ centre, rotation: rotationOf(unit(turn)) });
   }
 }

@@ -512,6 +512,24 @@ def test_the_address_holds_the_view(browser: Any, ball: Viewer, tmp_path: Path):
     ball.run("viewer.reset()")
 
 
+@pytest.mark.parametrize("fragment", ["#c=1,2,&q=1,0,0,0&d=1", "#c=,,&q=,,,&d=", "#%E0%A4%A&v=depth"])
+def test_an_address_cut_short_opens_the_first_view(browser: Any, ball: Viewer, fragment: str):
+    page = Viewer(browser, ball.own, fragment=fragment)
+    assert page.run("[viewer.navigation.pose, viewer.view]") == [ball.run("viewer.home()"), "colour"]
+    assert page.faults == []
+    page.close()
+
+
+@pytest.mark.parametrize("view", ["cost", "toString", "", "Depth"])
+def test_an_address_with_an_unknown_view_opens(browser: Any, ball: Viewer, view: str):
+    page = Viewer(browser, ball.own, fragment=f"#c=0,0,-3&q=1,0,0,0&d=0.01&v={view}")
+    assert page.run("[viewer.navigation.pose.centre, viewer.view]") == [[0, 0, -3], "colour"]
+    assert page.faults == []
+    page.run("viewer.reset()")
+    assert page.run("viewer.navigation.distance") == ball.run("viewer.homeDistance"), "not the link's"
+    page.close()
+
+
 def test_controls_are_labelled_and_the_page_is_quiet(ball: Viewer):
     unnamed = """() => [...document.querySelectorAll("button, input, select, summary, canvas")]
       .filter((e) => !(e.labels?.length || e.textContent.trim() || e.getAttribute("aria-label"))).map((e) => e.id)"""
