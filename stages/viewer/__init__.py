@@ -12,7 +12,7 @@ from pydantic import Field
 from stages.contract import READING_SECONDS, Inputs, Progress, StageConfig, StageResult, Workload
 
 INPUTS = ("ingest", "normalise", "scale", "train")
-VERSION = 6
+VERSION = 7
 EXIT_CODE = 21
 RESUMES = False
 DISPENSABLE = ("mesh",)

@@ -83,10 +83,15 @@ class Viewer {
   }
 
   moved(kind) {
-    if (!kind) Object.assign(this, { photo: null, nextPhoto: null, playing: false });
+    if (!kind) this.leave();
     this.moveTime = now();
     this.renderer?.touch();
     this.panels?.update();
+  }
+
+  /** The view goes elsewhere: no photo fits it any more, and no path plays on. */
+  leave() {
+    Object.assign(this, { photo: null, nextPhoto: null, playing: null });
   }
 
   drawOver(request, target) {
@@ -105,7 +110,8 @@ class Viewer {
   async showPhoto(index) {
     const view = this.contents.views[index];
     this.lens = view.lens;
-    [this.photo, this.nextPhoto] = [null, index];
+    this.leave();
+    this.nextPhoto = index;
     this.changed(); // named at once, not by the first picture of the flight
     await this.navigation.flyTo(view.pose);
     if (this.nextPhoto !== index) return; // it was left on the way
@@ -120,8 +126,13 @@ class Viewer {
 
   reset() {
     this.lens = lensOf(this.contents.scene.lens);
-    this.photo = this.nextPhoto = null;
+    this.leave();
     return this.navigation.flyTo(this.home(), this.homeDistance);
+  }
+
+  level() {
+    this.leave();
+    return this.navigation.level();
   }
 
   // --- clicks: cameras, points to measure, points to orbit around
@@ -180,7 +191,7 @@ class Viewer {
     const point = this.pointAt((event.clientX - box.left) * ratio, (event.clientY - box.top) * ratio);
     if (!point || this.isMeasuring) return;
     const { pose } = this.navigation, depth = dot(subtract(point, pose.centre), forward(pose));
-    this.photo = this.nextPhoto = null;
+    this.leave();
     const aside = subtract(subtract(point, pose.centre), scaled(forward(pose), depth));
     this.navigation.flyTo({ ...pose, centre: add(pose.centre, aside) }, depth);
   }
@@ -192,14 +203,15 @@ class Viewer {
   }
 
   async play(secondsPerKey) {
-    this.playing = true;
-    const frames = this.path.frames(secondsPerKey), began = now();
-    for (let index = 0; this.playing && index < frames.length; index = Math.floor(((now() - began) / 1000) * FPS)) {
+    const frames = this.path.frames(secondsPerKey), began = now(), playing = {}, isOn = () => this.playing === playing;
+    this.leave();
+    [this.playing, this.navigation.flight] = [playing, null];
+    for (let index = 0; isOn() && index < frames.length; index = Math.floor(((now() - began) / 1000) * FPS)) {
       this.navigation.pose = frames[index];
       this.moved("playing");
       await new Promise(requestAnimationFrame);
     }
-    if (this.playing && frames.length) this.navigation.moveTo(frames[frames.length - 1]);
+    if (isOn() && frames.length) this.navigation.moveTo(frames[frames.length - 1]);
   }
 
   // --- the address holds the view

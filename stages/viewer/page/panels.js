@@ -56,7 +56,7 @@ class Panels {
       viewer.changed();
     });
     this.on("reset", "click", () => viewer.reset());
-    this.on("level", "click", () => viewer.navigation.level());
+    this.on("level", "click", () => viewer.level());
     this.on("screenshot", "click", () => this.screenshot());
     this.on("link", "click", async () => {
       viewer.writeLink();
@@ -185,7 +185,7 @@ class Panels {
 
   keyed(event) {
     const key = event.key.toLowerCase(), view = Object.keys(VIEWS)[Number(key) - 1];
-    if (key === "escape") this.viewer.playing = false;
+    if (key === "escape") this.viewer.playing = null;
     if (key === "escape" && !byId("compare").hidden) this.viewer.leavePhoto();
     if (!isForScene(event)) return;
     if (key >= "1" && key <= "4" && key.length === 1) document.querySelector(`input[name="view"][value="${view}"]`).click();

@@ -119,6 +119,34 @@ def test_a_path_is_played_back_from_key_to_key(ball: Viewer):
     ball.until("!viewer.navigation.flight")
 
 
+def test_a_playing_path_and_a_photo_exclude_each_other(ball: Viewer):
+    ball.run("() => { viewer.path.keys = viewer.contents.views.slice(0, 3).map((view) => view.pose); }")
+    ball.run("viewer.showPhoto(1)")
+    ball.until("viewer.photo === 1")
+    ball.run("() => { window.first = viewer.play(30), window.second = viewer.play(30); }")
+    ball.run("first")  # it ends where the second begins
+    assert ball.run("[viewer.photo, byId('compare').hidden, Boolean(viewer.playing)]") == [None, True, True]
+    ball.run("viewer.showPhoto(5)")
+    ball.until("viewer.photo === 5")
+    assert ball.run("viewer.navigation.pose.centre") == ball.run("viewer.contents.views[5].pose.centre")
+    ball.run("() => { viewer.play(30); viewer.reset(); }")
+    ball.run("second")
+    ball.until("!viewer.navigation.flight")
+    assert ball.run("viewer.navigation.pose") == ball.run("viewer.home()")
+    ball.run("() => { viewer.path.keys = []; viewer.changed(); }")
+
+
+def test_a_levelled_view_shows_no_photo(ball: Viewer):
+    ball.run("viewer.showPhoto(1)")
+    ball.until("viewer.photo === 1")
+    ball.run("() => { viewer.navigation.pose = turnedPose(viewer.navigation.pose, [0, 1, 0], 0.2, [0, 0, 0]); }")
+    ball.page.locator("#level").evaluate("(button) => button.click()")
+    ball.until("!viewer.navigation.flight")
+    assert ball.run("[viewer.photo, byId('compare').hidden]") == [None, True]
+    ball.run("viewer.reset()")
+    ball.until("!viewer.navigation.flight")
+
+
 def test_of_the_fields_before_nothing_is_kept(ball: Viewer):
     replaced = """() => {
       const asked = [], { field, views } = viewer.contents, section = (n) => () => void asked.push(n);
