@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 from pipeline.batch import batch_file
 from pipeline.batch.batch_file import BatchFile, SceneFailure, SceneState
 from pipeline.batch.page import PAGE, write_page
-from pipeline.batch.scene_run import Ending, SceneRun, figures_of, run_scene, run_scene_apart
+from pipeline.batch.scene_run import Ending, SceneRun, figures_of, run_scene
 from pipeline.batch.scenes import Scene, printable
 from pipeline.engine.display import Display
 from stages.contract import StageError
@@ -81,7 +81,7 @@ def _run_all(batch: Batch, display: Display) -> int:
     words = [f"{len(state.scenes)} scenes", f"results in {batch.folder}{limit}", *cluster.described()]
     display.headline(" · ".join(words))
     here = partial(_run_here, batch, state, display)
-    for ending in cluster.fan_out(run_scene_apart, _begun(batch, state, display), here, "machine"):
+    for ending in cluster.fan_out(run_scene, _begun(batch, state, display), here, "machine"):
         if batch.cluster is not None:
             display.begin(ending.name)  # several run at a time, which a live line has no room for
         _end(batch, state, ending, display)

@@ -39,29 +39,25 @@ class Ending(NamedTuple):
 
 def run_scene(run: SceneRun, follow: Callable[[str, float | None], None] = lambda line, done: None) -> Ending:
     """Run a scene. What it says goes to its log; ``follow`` gets its live line and the finished fraction of the stage.
-    Where this process is interrupted, the run is, too, and has ended when the exception goes on."""
+    Where this process is interrupted, the run is, too, and has ended when the exception goes on. Where a process was
+    killed with the same scene, its run ends by itself in a moment, which is waited for."""
     began = time.monotonic()
+    while True:
+        line, failure = _attempted(run, follow)
+        seconds = time.monotonic() - began
+        if failure is None or failure.code != "pipeline.workspace-in-use" or seconds > ENDING_SECONDS:
+            return Ending(run.name, line, failure, seconds)
+        follow("waits: another run has not ended there", None)
+        time.sleep(1.0)
+
+
+def _attempted(run: SceneRun, follow: Callable[[str, float | None], None]) -> tuple[str, SceneFailure | None]:
     try:
-        line, failure = _run(run, follow)
+        return _run(run, follow)
     except OSError as error:
         hint = "Give the same command again; what is finished is kept."
         why = error.strerror or str(error)
-        line = ""
-        failure = SceneFailure(stage=None, code="pipeline.scene-not-run", what="cannot run it", why=why, hint=hint)
-    return Ending(run.name, line, failure, time.monotonic() - began)
-
-
-def run_scene_apart(run: SceneRun) -> Ending:
-    """:func:`run_scene` on a machine of a cluster. Where a process was killed with the same scene, its run ends by
-    itself in a moment, which is waited for."""
-    began = time.monotonic()
-    while True:
-        ending = run_scene(run)
-        seconds = time.monotonic() - began
-        in_use = ending.failure is not None and ending.failure.code == "pipeline.workspace-in-use"
-        if not in_use or seconds > ENDING_SECONDS:
-            return ending._replace(seconds=seconds)
-        time.sleep(1.0)
+        return "", SceneFailure(stage=None, code="pipeline.scene-not-run", what="cannot run it", why=why, hint=hint)
 
 
 def _run(run: SceneRun, follow: Callable[[str, float | None], None]) -> tuple[str, SceneFailure | None]:

@@ -9,6 +9,7 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
 import numpy as np
@@ -243,6 +244,19 @@ def test_a_scene_ends_with_its_batch(scenes: Path, tmp_path: Path, signal_number
     assert states(out)[HOSTILE] == "running"
     assert run_command(["batch", str(scenes), "-o", str(out), *ONLY_INGEST]) == exit_codes.BATCH
     assert states(out) == {HOSTILE: "done", "bad": "failed", "z": "done"}
+
+
+def test_a_run_that_outlives_its_batch_is_waited_for(scenes: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    (out / "z.nerf").mkdir(parents=True)
+    other = FileLock(out / "z.nerf" / ".lock", thread_local=False)
+    other.acquire()
+    ending = Timer(4, other.release)
+    ending.start()
+    assert run_command(["batch", str(scenes), "-o", str(out), *ONLY_INGEST]) == exit_codes.BATCH
+    ending.join()
+    assert states(out) == {HOSTILE: "done", "bad": "failed", "z": "done"}
+    assert "is in use" in (out / "z.log").read_text()
 
 
 def test_two_batches_do_not_share_a_folder(scenes: Path, tmp_path: Path):
