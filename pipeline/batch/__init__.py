@@ -93,7 +93,8 @@ def _run_all(batch: Batch, display: Display) -> int:
 
 
 def _continued(batch: Batch, before: BatchFile) -> BatchFile:
-    """How the scenes stand at the start: as they were left, but that failed ones wait."""
+    """How the scenes stand at the start: as they were left, but that failed ones wait, and that a first budget does not
+    pay for what was spent before."""
     scenes = dict[str, SceneState]()
     for scene in batch.scenes:
         known, photos = before.scenes.get(scene.name), printable(os.path.abspath(scene.photos))
@@ -103,6 +104,8 @@ def _continued(batch: Batch, before: BatchFile) -> BatchFile:
             scenes[scene.name] = SceneState(photos=photos, spent=known.spent)
         else:
             scenes[scene.name] = known
+        if before.budget is None and batch.budget is not None:
+            scenes[scene.name].spent = 0.0
     return BatchFile(folder=printable(os.path.abspath(batch.of)), budget=batch.budget, scenes=scenes)
 
 

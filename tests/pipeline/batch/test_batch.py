@@ -161,6 +161,15 @@ def test_a_scene_for_which_no_time_is_left_says_so(scenes: Path, tmp_path: Path,
     assert batch_file.read(out).scenes[HOSTILE].allocated == known[HOSTILE].allocated, "done: it keeps its settings"
 
 
+def test_a_first_budget_pays_for_nothing_before(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(scene_run, "COMMAND", ["-c", "import time; time.sleep(2)"])
+    out = tmp_path / "out"
+    assert run_command(["batch", str(scenes), "-o", str(out)]) == 0
+    monkeypatch.setattr(scene_run, "COMMAND", ["-c", "pass"])
+    assert run_command(["batch", str(scenes), "-o", str(out), "--budget", "6s"]) == 0
+    assert batch_file.read(out).scenes[HOSTILE].allocated == 2
+
+
 @pytest.mark.parametrize(
     "words",
     [["--json", "scenes"], ["scenes", "--train.steps", "0"], ["scenes", "--budget", "2m", "--train.steps", "9"],
