@@ -7,11 +7,11 @@ from pydantic import Field, field_validator
 
 from stages.contract import Auto, Flexible, Inputs, Progress, StageConfig, StageResult, Workload
 from stages.io.files import read_scene, write_json
-from stages.render.plan import MIN_WIDTH, PathKind, even_width
+from stages.render.plan import MAX_GIVEN_FPS, MIN_WIDTH, PathKind, even_width
 from stages.train import trained_seconds
 
 INPUTS = ("normalise", "train")
-VERSION = 14
+VERSION = 15
 EXIT_CODE = 16
 RESUMES = False
 PUBLISHED = ("video.mp4", "depth.mp4", "path.json")
@@ -47,8 +47,8 @@ class Config(StageConfig):
     fps: Auto[int] = Field(
         default=None,
         ge=1,
-        le=120,
-        description="Frames per second (default: 30; fewer for a video of fewer than 120 frames).",
+        le=MAX_GIVEN_FPS,
+        description="Frames per second (default: that of --render.cameras; else 30, fewer for fewer than 120 frames).",
     )
     seconds: Auto[float] = Field(
         default=None,

@@ -15,10 +15,10 @@ from nerf.geometry.camera_paths import levelled, nearest_rotations
 from nerf.geometry.near_far import near_and_far_between_views
 from nerf.geometry.rays import Rays, rays_of_view
 from nerf.geometry.scene import Camera, Scene, Similarity
-from stages.contract import StageError
+from stages.contract import StageError, bounded
 from stages.io.transforms_export import OPENGL_FROM_OPENCV
 from stages.io.transforms_files import pose_matrix, read_transforms
-from stages.render.plan import PathKind
+from stages.render.plan import MAX_GIVEN_FPS, PathKind
 from stages.sfm.colmap.cameras import camera_rays, rescaled
 from stages.sfm.imported.transforms_intrinsics import intrinsics_of, read_intrinsics
 
@@ -31,10 +31,12 @@ MAX_FOCAL_RATIO = 1.1  # between the longest and the shortest focal length of ph
 
 @dataclass(frozen=True)
 class CameraPath:
-    """One camera, all of one size, and one pose ``scene_from_camera`` (frames, 3, 4) per frame."""
+    """One camera, all of one size, and one pose ``scene_from_camera`` (frames, 3, 4) per frame; ``fps`` where the file
+    that they come from has one."""
 
     cameras: tuple[Camera, ...]
     poses: np.ndarray
+    fps: int | None = None
 
     def resized(self, width: int) -> "CameraPath":
         """The same views, ``width`` pixels wide; width and height even."""
@@ -167,7 +169,19 @@ def path_from_file(scene: Scene, file: Path) -> CameraPath:
             "its frames differ in size",
             "Give all frames one w and h.",
         )
-    return CameraPath(tuple(cameras), np.stack(poses))
+    return CameraPath(tuple(cameras), np.stack(poses), _fps(content, file))
+
+
+def _fps(content: dict[str, Any], file: Path) -> int | None:
+    """Frames per second of a path.json; None where the file has none. Raises StageError where no video has it."""
+    value = content.get("fps")
+    if value is None:
+        return None
+    if not isinstance(value, int | float) or not 0.5 < value <= MAX_GIVEN_FPS:
+        hint = "Correct it, or leave it out and give --render.fps."
+        why = f"its fps is {bounded(repr(value))} instead of a number from 1 to {MAX_GIVEN_FPS}"
+        raise StageError("render.unusable-fps", f"cannot make a video of {file.name}", why, hint)
+    return round(value)
 
 
 def _in_scene(matrix: Any, scene_from_sfm: Similarity) -> np.ndarray:

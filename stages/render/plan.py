@@ -12,6 +12,7 @@ MAX_FRAMES, MIN_FRAMES, MIN_STILLS = 120, 24, 6  # four smooth seconds, a turn i
 MAX_SIDE, DEFAULT_SIDE, SMALL_SIDE, MIN_SIDE = 1920, 480, 200, 32  # pixels
 MIN_WIDTH = 16  # pixels, whatever the height: of --render.width, too
 MAX_FPS, DEFAULT_SECONDS = 30, 4.0
+MAX_GIVEN_FPS = 120
 
 
 def choose_frames_and_width(

@@ -49,8 +49,8 @@ def planned(config: "Config", inputs: Inputs, progress: Progress) -> "Config":
         frames, width = _choose_frames_and_width(
             path, scene, inputs["train"], downscale, (frames, width), time_budget, progress
         )
-    kept = None if config.cameras else frames
-    return config.model_copy(update={"frames": kept, "width": width, "fps": config.fps or default_fps(frames)})
+    kept, fps = None if config.cameras else frames, config.fps or path.fps or default_fps(frames)
+    return config.model_copy(update={"frames": kept, "width": width, "fps": fps})
 
 
 def _choose_frames_and_width(

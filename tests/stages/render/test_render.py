@@ -220,6 +220,22 @@ def test_a_written_path_can_be_given_back_as_cameras(inputs, progress, tmp_path:
     assert np.abs(frames.astype(int) - read_video(tmp_path / "first.mp4")[0]).mean() < 1
 
 
+@pytest.mark.parametrize(("told", "given", "fps"), [(24, None, 24), (29.97, None, 30), (24, 10, 10), (None, None, 1)])
+def test_a_paths_fps_is_the_videos(inputs, progress, told: float | None, given: int | None, fps: int) -> None:
+    run(inputs, progress, frames=5, width=40)
+    content = read_json(inputs["render"] / "path.json") | {"fps": told}
+    write_json(cameras := inputs["render"].parent / "cameras.json", content)
+    run(inputs, progress, cameras=cameras, width=40, fps=given)
+    assert read_video(inputs["render"] / "video.mp4")[1] == fps
+
+
+@pytest.mark.parametrize("fps", [0, -1, 121, "30", [30]])
+def test_an_impossible_fps_is_refused(fps: object, tmp_path: Path) -> None:
+    frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist()}
+    with refused("render.unusable-fps", "t.json", repr(fps)):
+        given_path({"frames": [frame], "fps": fps}, scene_with(ring(5)), tmp_path)
+
+
 def test_ray_directions_are_made_per_frame_and_lens(monkeypatch) -> None:
     """500 lenses at full size would be 12 GB."""
     made = []
