@@ -11,7 +11,7 @@ from types import NoneType
 from typing import Annotated, Any, TypeVar, Union, get_args
 
 import tyro
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 from tyro.constructors import PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from pipeline.cli.options import UsageError, wrong_options
@@ -160,7 +160,7 @@ class ViewArguments:
     """Show a workspace in the browser, and follow the training that runs in it. Ctrl-C leaves the training alone."""
 
     workspace: tyro.conf.Positional[Path]
-    port: Auto[Annotated[int, Field(ge=1, le=65535)]] = None
+    port: Auto[int] = None
     """The port of this machine at which the page is served (default: a free one)."""
     json: bool = False
     """Print the address as a JSON object."""

@@ -41,6 +41,7 @@ from stages.hardware import cluster
 from stages.hardware.ranks import launched
 from stages.io.amounts import duration
 
+MAX_PORT = 65535
 REPORT_IT = "Finished stages are kept. Please report it with the output of the same command and --debug."
 
 
@@ -389,7 +390,10 @@ def _watched(root: Path, wanted: bool, display: Display) -> Iterator[None]:
 def command_view(words: Sequence[str]) -> int:
     """``pipeline view WORKSPACE``: until Ctrl-C."""
     given = arguments.parse(arguments.ViewArguments, "view", words)
+    if given.port is not None and not 1 <= given.port <= MAX_PORT:
+        raise UsageError(f"--port {given.port}: a port is a number from 1 to {MAX_PORT}")
     workspace = Workspace.existing(given.workspace)
+    workspace.read_run()  # a page could only say that there is nothing to show
     check_installed()
     from pipeline.view.server import ViewServer
 

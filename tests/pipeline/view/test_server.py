@@ -22,6 +22,8 @@ from typing import Any, NamedTuple
 import pytest
 
 from pipeline import view
+from pipeline.cli import exit_codes
+from pipeline.cli.commands import run_command
 from pipeline.engine.run_file import RunFile, write
 from pipeline.view.server import NICENESS, ViewServer, listening
 from stages.train.live import FINISH, LIVE
@@ -224,6 +226,18 @@ def test_a_taken_port_is_refused() -> None:
     with refused("pipeline.view-port", taken.getsockname()[1]):
         listening(taken.getsockname()[1])
     taken.close()
+
+
+@pytest.mark.parametrize("port", ["0", "-1", "65536"])
+def test_an_impossible_port_is_a_usage_error(port: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["view", str(tmp_path), f"--port={port}"]) == exit_codes.USAGE
+    assert f"--port {port}: a port is a number from 1 to 65535" in capsys.readouterr().err
+
+
+def test_a_damaged_run_file_is_said_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "run.json").write_text("{")
+    assert run_command(["view", str(tmp_path)]) == exit_codes.WORKSPACE
+    assert "cannot read" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(os.name != "posix", reason="elsewhere the option would share the port with others")
