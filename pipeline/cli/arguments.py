@@ -269,6 +269,7 @@ def parse(kind: type[T], command: str, words: Sequence[str]) -> T:
         name: tyro.MISSING for name in ("photos", "scenes", "workspace", "stage") if name in kind.__annotations__
     }
     default: Any = kind(**positional)
+    _check_none_is_empty(command, words)
     said = io.StringIO()
     try:
         with redirect_stderr(said):
@@ -279,6 +280,13 @@ def parse(kind: type[T], command: str, words: Sequence[str]) -> T:
         if "photos" in positional and (surplus := _surplus_file(kind, words, default)):
             raise UsageError(f"{surplus} is one file too many; give the folder that holds the photos") from ending
         raise UsageError(f"{_what_is_wrong(ending, said.getvalue())} (pipeline {command} --help)") from ending
+
+
+def _check_none_is_empty(command: str, words: Sequence[str]) -> None:
+    """Raises UsageError for what a shell makes of a variable that is not set: as a path it would be this folder."""
+    for before, word in pairwise([f"pipeline {command}", *words]):
+        if not word or (word.startswith("-") and word.endswith("=")):
+            raise UsageError(f"nothing is given after {word or before}")
 
 
 def with_flags(settings: Settings, parsed: Settings, command: str, words: Sequence[str]) -> Settings:

@@ -65,6 +65,8 @@ def test_help_of_run_lists_the_stage_options(capsys: pytest.CaptureFixture[str])
         (["--budget", "2m", "--train.steps", "50"], "--budget 2m and --train.steps 50: "),
         (["--budget", "2m", "--until", "tradeoff"], "--budget and --until tradeoff: "),
         (["--more", "9m", "--config", "a.toml"], "--more uses the recorded options, not those of --config a.toml"),
+        (["-o", ""], "nothing is given after -o"),
+        (["--output="], "nothing is given after --output="),
         (["--train.stepz", "5"], "Unrecognized options: --train.stepz, 5; perhaps --train.steps"),
     ],
 )  # fmt: skip
