@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, ValidationError
 
 from pipeline.engine.settings import Settings
+from pipeline.engine.stage_list import STAGES
 from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace, is_result, lasting, photo_set
 from stages.contract import bounded
 from stages.effects.effect_list import EFFECTS
@@ -133,10 +134,16 @@ def with_lasting_cameras(settings: Settings, root: Path) -> Settings:
 
 
 def check_workspace(root: Path, photos: Path) -> None:
-    """Raises UsageError where the workspace would lie right among the photos: what a run writes is none of them; and
-    where the photos are a result of it, which a run takes out of its ``output/`` before it reads them."""
-    places = [place for place in (photos, photos / "images") if not (place / RUN_FILE).is_file()]
-    if photos.is_dir() and os.path.realpath(root) in map(os.path.realpath, places):
+    """Raises UsageError where the workspace, or a folder in it that a run writes to, would lie right among the photos:
+    what a run writes is none of them; and where the photos are a result of it, which a run takes out of its
+    ``output/`` before it reads them."""
+    places = [place for place in (photos, photos / "images") if photos.is_dir() and not (place / RUN_FILE).is_file()]
+    real = {os.path.realpath(place) for place in places}
+    for name in (*STAGES, "output"):
+        if os.path.realpath(root / name) in real:
+            what = f"the photos lie in its folder {name}, to which a run writes"
+            raise UsageError(f"-o {root}: {what}; give another folder with -o")
+    if os.path.realpath(root) in real:
         better = f"leave out -o to write to {default_workspace(photos)}, or give another folder"
         raise UsageError(f"-o {root}: that is a folder of photos; {better}")
     if is_result(photos, root):

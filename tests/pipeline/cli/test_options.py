@@ -173,6 +173,17 @@ def test_nothing_is_written_among_the_photos(
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.parametrize("name", ["ingest", "evaluate", "train", "output"])
+def test_a_run_writes_into_no_folder_of_its_photos(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """`pipeline run data/train -o data`: what stage train writes would be photos of the next run."""
+    photos = tmp_path / "data" / name
+    photos.mkdir(parents=True)
+    Image.new("RGB", (40, 30)).save(photos / "a.png")
+    assert run_command(["run", str(photos), "-o", str(tmp_path / "data"), "--until", "ingest"]) == 2
+    assert f"the photos lie in its folder {name}, to which a run writes" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "data").rglob("*")] == [name, "a.png"]
+
+
 def test_a_workspace_beside_its_photos_is_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "set/images").mkdir(parents=True)
     for k in range(3):
