@@ -125,7 +125,8 @@ def _begun(batch: Batch, state: BatchFile, display: Display) -> Iterator[SceneRu
             continue
         _write(batch, state)
         limit = () if own.allocated is None else ("--budget", f"{own.allocated:.0f}s")
-        arguments = (str(scene.photos), *batch.options, *limit, "-o", str(batch.workspace(scene.name)))
+        photos = str(scene.photos.absolute())  # of `batch .` the name alone might look like an option
+        arguments = (photos, *batch.options, *limit, "-o", str(batch.workspace(scene.name)))
         yield SceneRun(scene.name, arguments, batch.log(scene.name), Path.cwd())
 
 

@@ -131,6 +131,12 @@ def test_words_of_the_batch_are_not_handed_on(scenes: Path, tmp_path: Path, monk
     assert said.read_text().splitlines()[0] == repr([str(scenes / HOSTILE), *given, "--json"])
 
 
+def test_a_scene_may_be_called_like_an_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    add_photos(tmp_path / "scenes" / "-x")
+    monkeypatch.chdir(tmp_path / "scenes")
+    assert run_command(["batch", ".", "-o", str(tmp_path / "out"), *ONLY_INGEST]) == 0
+
+
 @pytest.mark.parametrize("words", [["-o", "out"], ["-oout"], ["--output", "out"], ["--output=out"]])
 def test_the_folder_is_the_batchs_own(words: list[str], scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
