@@ -257,6 +257,7 @@ def test_a_scene_ends_with_its_batch(scenes: Path, tmp_path: Path, signal_number
     process.communicate(timeout=60)
     wait_until(lambda: not alive(child))
     assert states(out)[HOSTILE] == "running"
+    assert "(begun)" in (out / PAGE).read_text("utf-8"), "of a batch that has ended nothing runs"
     assert run_command(["batch", str(scenes), "-o", str(out), *ONLY_INGEST]) == exit_codes.BATCH
     assert states(out) == {HOSTILE: "done", "bad": "failed", "z": "done"}
 
