@@ -9,7 +9,7 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
-from threading import Timer
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -267,7 +267,15 @@ def test_a_run_that_outlives_its_batch_is_waited_for(scenes: Path, tmp_path: Pat
     (out / "z.nerf").mkdir(parents=True)
     other = FileLock(out / "z.nerf" / ".lock", thread_local=False)
     other.acquire()
-    ending = Timer(4, other.release)
+
+    def end_once_met() -> None:
+        for _ in range(600):
+            if (out / "z.log").is_file() and "is in use" in (out / "z.log").read_text():
+                break
+            time.sleep(0.1)
+        other.release()
+
+    ending = Thread(target=end_once_met)
     ending.start()
     assert run_command(["batch", str(scenes), "-o", str(out), *ONLY_INGEST]) == exit_codes.BATCH
     ending.join()
