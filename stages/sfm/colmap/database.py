@@ -197,7 +197,7 @@ def extract_features(
     extraction: ExtractionOptions,
     on_few: Callable[[float, ExtractionOptions], None] = lambda median, chosen: None,
     turns: Turns = NO_TURNS,
-) -> None:
+) -> float:
     """SIFT keypoints and descriptors of every photo that has none yet, where ``masks/<image name>.png`` is not black,
     or anywhere where that is not there. ``turns`` are those that the database was filled with.
 
@@ -206,29 +206,34 @@ def extract_features(
     half of some photos yield few features, as smooth things do, all are enlarged: those of an enlarged photo hardly
     match those of another that is not. Where that is no help, as in fog, under water and in the dark, the contrast of
     all is made even if that yields many times more: SIFT counts it in absolute grey levels. ``on_few`` is told then
-    what the photos yield as they are, and what was chosen.
+    what the photos yield as they are, and what was chosen. Returns the seconds that the chosen way took, without those
+    of what else was tried on some photos.
     """
     with pycolmap.Database.open(database) as db:
         todo = [number for number in range(len(photos)) if not db.exists_descriptors(number + 1)]
     if not todo:
-        return
+        return 0.0
     some = spread(len(photos), min(len(photos), COUNTED_PHOTOS))
     counted = [photos[number] for number in some]
-    few, yielded = MIN_FEATURES_SHARE * extraction.max_features, []
+    few, yielded, seconds = MIN_FEATURES_SHARE * extraction.max_features, [], []
     ways = [extraction, *extraction.for_few_features(counted)]
     with tempfile.TemporaryDirectory(dir=database.parent) as folder:
         for way in ways:
+            began = time.monotonic()
             tried = Path(folder, f"{len(yielded)}.db")
             fill_database(tried, counted, MAPPING_MODEL, turns=turns)
             _extract(tried, images, counted, way, turns)
             yielded.append(_median_features(tried, len(some)))
+            seconds.append(time.monotonic() - began)
             if yielded[-1] >= few:
                 break
         best = max(range(len(yielded)), key=lambda n: yielded[n] / (MIN_CONTRAST_GAIN if ways[n].even_contrast else 1))
         if best:
             on_few(yielded[0], ways[best])
         _copy_features(Path(folder, f"{best}.db"), database, some)
+    began = time.monotonic()
     _extract(database, images, photos, ways[best], turns)
+    return seconds[best] + time.monotonic() - began
 
 
 def _median_features(database: Path, count: int) -> float:

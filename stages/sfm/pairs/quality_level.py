@@ -208,12 +208,11 @@ def measure(images: str, photos: list[dict[str, Any]], max_image_size: int, max_
     with tempfile.TemporaryDirectory() as scratch:
         database = Path(scratch, "some.db")
         fill_database(database, some, MAPPING_MODEL)
-        started = time.monotonic()
-        extract_features(database, Path(images), some, ExtractionOptions(max_image_size, max_features))
+        seconds = extract_features(database, Path(images), some, ExtractionOptions(max_image_size, max_features))
         extracted = time.monotonic()
         words = read_vocabulary(database, len(some), 0, CELLS) if indexed else None
         match_pairs(database, pairs, 0, STRICT_RATIO, features=Features(words))
-        return Cost((extracted - started) / len(some), (time.monotonic() - extracted) / len(pairs))
+        return Cost(seconds / len(some), (time.monotonic() - extracted) / len(pairs))
 
 
 if __name__ == "__main__":

@@ -3,8 +3,11 @@
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
+from itertools import count
 from pathlib import Path
 from threading import get_ident
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -330,6 +333,15 @@ def test_contrast_is_made_even_where_most_photos_are_faint(tmp_path: Path) -> No
             found = np.array(db.read_keypoints(number), float)
             nearest = np.linalg.norm(found[:, None, :2] - there[:, :2], axis=2).min(axis=0)
             assert (nearest < 1.5).mean() > 0.6  # of blobs upon blobs others are found
+
+
+def test_only_the_seconds_of_the_chosen_way_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    photos = pictures(tmp_path, 1, 2)
+    monkeypatch.setattr(database_module, "time", SimpleNamespace(monotonic=partial(next, count())))
+    fill_database(tmp_path / "timed.db", photos, "SIMPLE_RADIAL")
+    chosen: list[tuple[float, ExtractionOptions]] = []
+    took = extract_features(tmp_path / "timed.db", tmp_path, photos, ASKED, lambda *few: chosen.append(few))
+    assert len(chosen) == 1 and took == 2  # on some photos and on all, each from one reading of the clock to the next
 
 
 def test_clear_photos_of_few_features_keep_their_contrast(tmp_path: Path) -> None:
