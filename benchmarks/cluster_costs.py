@@ -40,7 +40,7 @@ from pipeline.engine.workspace import Workspace
 from stages.hardware import cluster
 from stages.io.files import read_json
 from stages.io.photos import Photo, read_photos, spread
-from stages.sfm.colmap.database import (
+from stages.sfm.colmap.database.extraction import (
     BLOCK_SIZE,
     MAPPING_MODEL,
     STRICT_RATIO,

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.record import Record, add_out
 from stages.io.photos import Photo, read_photos
-from stages.sfm.colmap.database import (
+from stages.sfm.colmap.database.extraction import (
     MAPPING_MODEL,
     STRICT_RATIO,
     ExtractionOptions,

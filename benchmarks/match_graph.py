@@ -18,7 +18,7 @@ import pycolmap
 
 from benchmarks.record import Record, add_out
 from stages.io.photos import read_photos
-from stages.sfm.colmap.database import (
+from stages.sfm.colmap.database.extraction import (
     MAPPING_MODEL,
     STRICT_RATIO,
     ExtractionOptions,

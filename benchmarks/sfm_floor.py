@@ -31,7 +31,7 @@ from pipeline.cli.terminal import PlainDisplay
 from stages import ingest
 from stages.hardware.device import processors
 from stages.io.photos import Photo, read_photos
-from stages.sfm.colmap.database import (
+from stages.sfm.colmap.database.extraction import (
     MAPPING_MODEL,
     STRICT_RATIO,
     ExtractionOptions,

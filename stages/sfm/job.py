@@ -14,7 +14,7 @@ from typing import Any
 
 from stages.io.files import write_durably
 from stages.io.photos import Photo
-from stages.sfm.colmap.database import (
+from stages.sfm.colmap.database.extraction import (
     NO_TURNS,
     Features,
     image_similarity,

@@ -11,7 +11,7 @@ import numpy as np
 from stages.contract import Note
 from stages.ingest.masks import write_feature_masks
 from stages.io.amounts import rough_duration
-from stages.sfm.colmap.database import (
+from stages.sfm.colmap.database.extraction import (
     MAPPING_MODEL,
     RELAXED_RATIO,
     STRICT_RATIO,

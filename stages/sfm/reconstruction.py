@@ -14,7 +14,7 @@ from stages.contract import Note, Progress, StageError, listed
 from stages.hardware.memory import check_memory
 from stages.io.photos import Photo, read_photos
 from stages.sfm.colmap.cameras import is_valid
-from stages.sfm.colmap.database import ExtractionOptions, feature_bytes
+from stages.sfm.colmap.database.extraction import ExtractionOptions, feature_bytes
 from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.conventions import PoseConvention
 from stages.sfm.imported.import_poses import import_poses

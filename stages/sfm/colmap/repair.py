@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from stages.contract import Note
 from stages.sfm.colmap.correspondences import read_pair_matches
-from stages.sfm.colmap.database import copy_without_pairs, finish_copy, keep_inliers, unfinished_copy
+from stages.sfm.colmap.database.extraction import copy_without_pairs, finish_copy, keep_inliers, unfinished_copy
 from stages.sfm.colmap.mappers import map_incrementally
 from stages.sfm.colmap.models import load_native, write_native
 from stages.sfm.pairs.match_graph import ORDER_OVERLAP, connected

@@ -16,7 +16,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from stages.sfm.colmap.correspondences import Correspondences, read_correspondences
-from stages.sfm.colmap.database import FOCAL_GUESS, finish_copy, keep_inliers, unfinished_copy
+from stages.sfm.colmap.database.extraction import FOCAL_GUESS, finish_copy, keep_inliers, unfinished_copy
 from stages.sfm.pairs.match_graph import inlier_matrix, most_linked
 
 TRACKS_PER_PHOTO = 500  # of mapping: 1,000 take 1.7 times as long and move no camera by more (docs/stages/sfm.md)

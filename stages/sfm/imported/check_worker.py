@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from stages.ingest.masks import write_feature_masks
 from stages.io.photos import Photo
-from stages.sfm.colmap.database import (
+from stages.sfm.colmap.database.extraction import (
     MAPPING_MODEL,
     STRICT_RATIO,
     ExtractionOptions,

@@ -19,7 +19,7 @@ from stages.contract import Progress, StageError
 from stages.hardware.device import processors
 from stages.io.amounts import rough_duration
 from stages.io.photos import Photo, spread
-from stages.sfm.colmap.database import (
+from stages.sfm.colmap.database.extraction import (
     MAPPING_MODEL,
     STRICT_RATIO,
     ExtractionOptions,

@@ -10,7 +10,12 @@ from stages.contract import StageError
 from stages.hardware import memory
 from stages.hardware.memory import at_once, available_bytes, available_on, check_memory, rooms_in_groups
 from stages.io.photos import Photo
-from stages.sfm.colmap.database import BYTES_PER_PIXEL, EVEN_BYTES_PER_PIXEL, ExtractionOptions, feature_bytes
+from stages.sfm.colmap.database.extraction import (
+    BYTES_PER_PIXEL,
+    EVEN_BYTES_PER_PIXEL,
+    ExtractionOptions,
+    feature_bytes,
+)
 
 
 @pytest.fixture

@@ -14,12 +14,12 @@ import pycolmap
 import pytest
 from PIL import Image
 
-import stages.sfm.colmap.database as database_module
+import stages.sfm.colmap.database.extraction as database_module
 from stages.hardware import cluster
 from stages.ingest.orientation import QUARTER_TURNS, turned_size, upright
 from stages.io.photos import Photo
 from stages.sfm.colmap.cameras import pixel_map
-from stages.sfm.colmap.database import (
+from stages.sfm.colmap.database.extraction import (
     MIN_FEATURES_SHARE,
     ExtractionOptions,
     Features,
@@ -259,7 +259,7 @@ while True:
 
 def test_an_open_database_can_be_read_along(database: Path) -> None:
     reader = subprocess.Popen(
-        [sys.executable, "-c", READER, str(database)], stdout=subprocess.PIPE, cwd=Path(__file__).parents[4]
+        [sys.executable, "-c", READER, str(database)], stdout=subprocess.PIPE, cwd=Path(__file__).parents[5]
     )
     try:
         assert reader.stdout and reader.stdout.readline() == b"ready\n"

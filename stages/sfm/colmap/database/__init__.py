@@ -1,0 +1,1 @@
+"""COLMAP's database: features, matches, copies of it."""
