@@ -40,18 +40,10 @@ from pipeline.engine.workspace import Workspace
 from stages.hardware import cluster
 from stages.io.files import read_json
 from stages.io.photos import Photo, read_photos, spread
-from stages.sfm.colmap.database.extraction import (
-    BLOCK_SIZE,
-    MAPPING_MODEL,
-    STRICT_RATIO,
-    ExtractionOptions,
-    Features,
-    extract_features,
-    fill_database,
-    image_similarity,
-    match_pairs,
-    read_vocabulary,
-)
+from stages.sfm.colmap.database.extraction import ExtractionOptions, extract_features
+from stages.sfm.colmap.database.features import Features, image_similarity, read_vocabulary
+from stages.sfm.colmap.database.images import MAPPING_MODEL, fill_database
+from stages.sfm.colmap.database.matching import BLOCK_SIZE, STRICT_RATIO, match_pairs
 from stages.sfm.pairs import MAX_EXHAUSTIVE
 from stages.sfm.pairs.image_retrieval import CELLS, WORDS
 from stages.sfm.pairs.match_graph import UNTESTED, next_pairs

@@ -26,7 +26,9 @@ from matplotlib.figure import Figure
 
 from benchmarks.record import Record, add_out, as_json, provenance
 from stages.hardware.cluster import MAX_RETRIES, MAX_WAITING
-from stages.sfm.colmap.database.extraction import BLOCK_SIZE, CACHE_SHARE, MIN_CACHED_PHOTOS, PHOTOS_AT_A_TIME
+from stages.sfm.colmap.database.extraction import PHOTOS_AT_A_TIME
+from stages.sfm.colmap.database.features import CACHE_SHARE, MIN_CACHED_PHOTOS
+from stages.sfm.colmap.database.matching import BLOCK_SIZE
 from stages.sfm.pairs.image_retrieval import WORDS
 
 RESULTS = Path(__file__).parent / "results"

@@ -20,17 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.record import Record, add_out
 from stages.io.photos import Photo, read_photos
-from stages.sfm.colmap.database.extraction import (
-    MAPPING_MODEL,
-    STRICT_RATIO,
-    ExtractionOptions,
-    Features,
-    extract_features,
-    fill_database,
-    image_similarity,
-    match_pairs,
-    read_vocabulary,
-)
+from stages.sfm.colmap.database.extraction import ExtractionOptions, extract_features
+from stages.sfm.colmap.database.features import Features, image_similarity, read_vocabulary
+from stages.sfm.colmap.database.images import MAPPING_MODEL, fill_database
+from stages.sfm.colmap.database.matching import STRICT_RATIO, match_pairs
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import Checked, camera_poses, check_model
 from stages.sfm.pairs.image_retrieval import CELLS

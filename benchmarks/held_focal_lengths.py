@@ -20,7 +20,7 @@ import numpy as np
 import pycolmap
 
 from benchmarks.record import Record, add_out
-from stages.sfm.colmap.database.extraction import verify_again
+from stages.sfm.colmap.database.matching import verify_again
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.mappers import incremental_options, map_incrementally
 from stages.sfm.colmap.repair import check_model

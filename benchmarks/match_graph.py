@@ -18,19 +18,10 @@ import pycolmap
 
 from benchmarks.record import Record, add_out
 from stages.io.photos import read_photos
-from stages.sfm.colmap.database.extraction import (
-    MAPPING_MODEL,
-    STRICT_RATIO,
-    ExtractionOptions,
-    Features,
-    extract_features,
-    fill_database,
-    image_similarity,
-    match_pairs,
-    read_descriptors,
-    read_vocabulary,
-    verified_matches,
-)
+from stages.sfm.colmap.database.extraction import ExtractionOptions, extract_features
+from stages.sfm.colmap.database.features import Features, image_similarity, read_descriptors, read_vocabulary
+from stages.sfm.colmap.database.images import MAPPING_MODEL, fill_database
+from stages.sfm.colmap.database.matching import STRICT_RATIO, match_pairs, verified_matches
 from stages.sfm.pairs.feature_matching import match_descriptors
 from stages.sfm.pairs.image_retrieval import CELLS
 from stages.sfm.pairs.match_graph import (

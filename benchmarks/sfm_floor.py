@@ -31,15 +31,10 @@ from pipeline.cli.terminal import PlainDisplay
 from stages import ingest
 from stages.hardware.device import processors
 from stages.io.photos import Photo, read_photos
-from stages.sfm.colmap.database.extraction import (
-    MAPPING_MODEL,
-    STRICT_RATIO,
-    ExtractionOptions,
-    extract_features,
-    fill_database,
-    match_pairs,
-    read_descriptors,
-)
+from stages.sfm.colmap.database.extraction import ExtractionOptions, extract_features
+from stages.sfm.colmap.database.features import read_descriptors
+from stages.sfm.colmap.database.images import MAPPING_MODEL, fill_database
+from stages.sfm.colmap.database.matching import STRICT_RATIO, match_pairs
 from stages.sfm.pairs.feature_matching import match_descriptors
 from stages.sfm.pairs.pair_selection import exhaustive
 from stages.sfm.pairs.quality_level import QUALITY_LEVELS

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from stages.contract import Note
 from stages.sfm import global_mapping
-from stages.sfm.colmap.database.extraction import adopt_cameras
+from stages.sfm.colmap.database.images import adopt_cameras
 from stages.sfm.colmap.diagnosis import compare_models, disagree
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.joining import Piece, join_pieces

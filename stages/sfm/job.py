@@ -14,14 +14,9 @@ from typing import Any
 
 from stages.io.files import write_durably
 from stages.io.photos import Photo
-from stages.sfm.colmap.database.extraction import (
-    NO_TURNS,
-    Features,
-    image_similarity,
-    keep_open,
-    read_vocabulary,
-    turns_of_cameras,
-)
+from stages.sfm.colmap.database.features import Features, image_similarity, read_vocabulary
+from stages.sfm.colmap.database.files import keep_open
+from stages.sfm.colmap.database.images import NO_TURNS, turns_of_cameras
 from stages.sfm.pairs import MAX_EXHAUSTIVE, Matcher
 from stages.sfm.pairs.image_retrieval import CELLS
 from stages.sfm.pairs.pair_selection import SimilarityMatrix

@@ -11,16 +11,12 @@ import numpy as np
 from stages.contract import Note
 from stages.ingest.masks import write_feature_masks
 from stages.io.amounts import rough_duration
-from stages.sfm.colmap.database.extraction import (
-    MAPPING_MODEL,
+from stages.sfm.colmap.database.copies import copy_as_fisheye, copy_without_matches_of, copy_without_pairs
+from stages.sfm.colmap.database.extraction import ExtractionOptions, extract_features
+from stages.sfm.colmap.database.images import MAPPING_MODEL, fill_database
+from stages.sfm.colmap.database.matching import (
     RELAXED_RATIO,
     STRICT_RATIO,
-    ExtractionOptions,
-    copy_as_fisheye,
-    copy_without_matches_of,
-    copy_without_pairs,
-    extract_features,
-    fill_database,
     match_pairs,
     matched_pairs,
     verified_matches,

@@ -9,7 +9,7 @@ import pycolmap
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from stages.sfm.colmap.database.extraction import copy_with_cameras_of
+from stages.sfm.colmap.database.copies import copy_with_cameras_of
 from stages.sfm.colmap.models import load_native, write_native
 from stages.sfm.retry_strategies import MIN_POSE_INLIERS, MappingOptions
 

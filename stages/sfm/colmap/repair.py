@@ -15,7 +15,8 @@ from jaxtyping import Float, Int
 
 from stages.contract import Note
 from stages.sfm.colmap.correspondences import read_pair_matches
-from stages.sfm.colmap.database.extraction import copy_without_pairs, finish_copy, keep_inliers, unfinished_copy
+from stages.sfm.colmap.database.copies import copy_without_pairs, keep_inliers
+from stages.sfm.colmap.database.files import changed_copy
 from stages.sfm.colmap.mappers import map_incrementally
 from stages.sfm.colmap.models import load_native, write_native
 from stages.sfm.pairs.match_graph import ORDER_OVERLAP, connected
@@ -130,8 +131,7 @@ def copy_consistent_matches(
 ) -> None:
     """Copy the database with only the verified matches that are consistent with a model which those of ``trusted``
     pairs (image ids, the lower first) made."""
-    unfinished = unfinished_copy(database, copy)
-    with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
+    with changed_copy(database, copy) as db:
         ids, matches = read_pair_matches(db, model, 0, most=None)
         pairs = np.array(ids)[matches.pairs].tolist()  # the lower id first, as COLMAP numbers pairs
         kept = consistent_matches(matches, camera_poses(model), np.array([(i, j) in trusted for i, j in pairs], bool))
@@ -142,7 +142,6 @@ def copy_consistent_matches(
             keep = mine.get((first, second), np.zeros(0, bool))
             if (first, second) not in trusted or len(keep):
                 keep_inliers(db, (first, second), geometry, keep)
-    finish_copy(unfinished, copy)
 
 
 def supported_steps(

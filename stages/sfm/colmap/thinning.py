@@ -16,7 +16,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from stages.sfm.colmap.correspondences import Correspondences, read_correspondences
-from stages.sfm.colmap.database.extraction import FOCAL_GUESS, finish_copy, keep_inliers, unfinished_copy
+from stages.sfm.colmap.database.copies import keep_inliers
+from stages.sfm.colmap.database.files import copy_database, unfinished_copy
+from stages.sfm.colmap.database.images import FOCAL_GUESS
 from stages.sfm.pairs.match_graph import inlier_matrix, most_linked
 
 TRACKS_PER_PHOTO = 500  # of mapping: 1,000 take 1.7 times as long and move no camera by more (docs/stages/sfm.md)
@@ -37,19 +39,18 @@ def thin_matches(database: Path, copy: Path, tracks: int = TRACKS_PER_PHOTO, *, 
     a guess that is a fifth off can take minutes to leave it, or end with intrinsics that project everything wrongly.
     Returns whether the pairs tell that of every camera.
     """
-    unfinished = unfinished_copy(database, copy)
-    with pycolmap.Database.open(unfinished) as db:
-        geometries = dict(zip(*db.read_two_view_geometries(), strict=True))
-        matches = read_correspondences(db, geometries)
-        cells = _cells(db, len(matches.begins) - 1)
-    calibrated = not camera_is_known and calibrate_focal_lengths(unfinished)
-    kept = best_tracks(matches, cells, tracks)[matches.keypoint[:, 0]]
-    bounds = np.searchsorted(matches.pair, np.arange(len(matches.pairs) + 1))
-    with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
-        for number, (first, second) in enumerate(matches.pairs.tolist()):
-            geometry = geometries[pycolmap.image_pair_to_pair_id(first, second)]
-            keep_inliers(db, (first, second), geometry, kept[bounds[number] : bounds[number + 1]])
-    finish_copy(unfinished, copy)
+    with unfinished_copy(database, copy) as unfinished:
+        with pycolmap.Database.open(unfinished) as db:
+            geometries = dict(zip(*db.read_two_view_geometries(), strict=True))
+            matches = read_correspondences(db, geometries)
+            cells = _cells(db, len(matches.begins) - 1)
+        calibrated = not camera_is_known and calibrate_focal_lengths(unfinished)
+        kept = best_tracks(matches, cells, tracks)[matches.keypoint[:, 0]]
+        bounds = np.searchsorted(matches.pair, np.arange(len(matches.pairs) + 1))
+        with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
+            for number, (first, second) in enumerate(matches.pairs.tolist()):
+                geometry = geometries[pycolmap.image_pair_to_pair_id(first, second)]
+                keep_inliers(db, (first, second), geometry, kept[bounds[number] : bounds[number + 1]])
     return calibrated
 
 
@@ -123,7 +124,8 @@ def calibrate_focal_lengths(database: Path) -> bool:
 
 def _calibrated(database: Path, factor: float) -> dict[int, float]:
     """By camera the calibrated focal length, of those for which one is found, beginning with ``factor`` × a guess."""
-    copy = unfinished_copy(database, database.with_name(f"{database.stem}-calibration.db"))
+    copy = database.with_name(f"{database.stem}-calibration.unfinished")  # no .db: it is no copy to resume with
+    copy_database(database, copy)
     with pycolmap.Database.open(copy) as db, pycolmap.DatabaseTransaction(db):
         for camera in db.read_all_cameras():
             set_focal_length(camera, factor * FOCAL_GUESS * max(camera.width, camera.height))

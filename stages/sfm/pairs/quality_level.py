@@ -19,16 +19,10 @@ from stages.contract import Progress, StageError
 from stages.hardware.device import processors
 from stages.io.amounts import rough_duration
 from stages.io.photos import Photo, spread
-from stages.sfm.colmap.database.extraction import (
-    MAPPING_MODEL,
-    STRICT_RATIO,
-    ExtractionOptions,
-    Features,
-    extract_features,
-    fill_database,
-    match_pairs,
-    read_vocabulary,
-)
+from stages.sfm.colmap.database.extraction import ExtractionOptions, extract_features
+from stages.sfm.colmap.database.features import Features, read_vocabulary
+from stages.sfm.colmap.database.images import MAPPING_MODEL, fill_database
+from stages.sfm.colmap.database.matching import STRICT_RATIO, match_pairs
 from stages.sfm.pairs import Matcher
 from stages.sfm.pairs.image_retrieval import CELLS
 from stages.sfm.pairs.pair_selection import CapturePriors, capture_priors, choose, exhaustive, expected_pairs

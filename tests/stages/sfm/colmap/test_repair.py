@@ -16,7 +16,8 @@ from PIL import Image
 from stages.io.photos import Photo
 from stages.sfm import global_mapping
 from stages.sfm.checked_mapping import Runs, _most_steps, _with_pieces_joined
-from stages.sfm.colmap.database.extraction import adopt_cameras, copy_without_pairs
+from stages.sfm.colmap.database.copies import copy_without_pairs
+from stages.sfm.colmap.database.images import adopt_cameras
 from stages.sfm.colmap.diagnosis import compare_models
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.mappers import incremental_options, map_incrementally

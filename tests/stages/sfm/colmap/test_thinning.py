@@ -8,7 +8,7 @@ import pytest
 from stages.io.photos import Photo
 from stages.sfm.colmap import thinning
 from stages.sfm.colmap.correspondences import Correspondences
-from stages.sfm.colmap.database.extraction import MAPPING_MODEL, fill_database
+from stages.sfm.colmap.database.images import MAPPING_MODEL, fill_database
 from stages.sfm.colmap.thinning import best_tracks, calibrate_focal_lengths
 
 PHOTOS, KEYPOINTS = 4, 6
