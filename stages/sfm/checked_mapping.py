@@ -8,7 +8,10 @@ from typing import Any, NamedTuple
 
 from stages.contract import Note
 from stages.sfm import global_mapping
+from stages.sfm.colmap.database.calibration import MAX_EXIF_RATIO, far_apart
 from stages.sfm.colmap.database.images import adopt_cameras
+from stages.sfm.colmap.database.matching import best_linked
+from stages.sfm.colmap.database.thinning import thin_matches
 from stages.sfm.colmap.diagnosis import compare_models, disagree
 from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.joining import Piece, join_pieces
@@ -28,7 +31,6 @@ from stages.sfm.colmap.repair import (
     supported_runs,
     supported_steps,
 )
-from stages.sfm.colmap.thinning import MAX_EXIF_RATIO, best_linked, far_apart, thin_matches
 from stages.sfm.job import JobState
 from stages.sfm.matching import capture_sequence, consecutive_pairs
 from stages.sfm.retry_strategies import MIN_MISSING_TO_START_OVER, STRATEGIES, MappingOptions, Strategy

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from stages.io.files import make_durable
+from stages.sfm.colmap.database.thinning import thin_matches
 from stages.sfm.colmap.mappers import map_globally
 from stages.sfm.colmap.models import write_native
-from stages.sfm.colmap.thinning import thin_matches
 from stages.sfm.job import end_with_parent
 from stages.sfm.worker_process import environment
 

@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 
 from nerf.geometry.alignment import align
+from stages.sfm.colmap.database.features import read_keypoints
 from stages.sfm.degeneracy import different_poses
 from stages.sfm.registration import PLANAR_CONFIGS
 from stages.sfm.retry_strategies import MIN_POSE_INLIERS
@@ -126,7 +127,7 @@ def supports(model: pycolmap.Reconstruction, database: Path, seed: int) -> dict[
         geometries = list(zip(*db.read_two_view_geometries(), strict=True)) if missing else []
         for image in sorted(missing, key=lambda image: image.image_id):
             points = _points_seen(image.image_id, geometries, model)
-            keypoints = np.asarray(db.read_keypoints(image.image_id), float)[:, :2]
+            keypoints = read_keypoints(db, image.image_id)
             known = model.exists_camera(image.camera_id)
             camera = model.camera(image.camera_id) if known else db.read_camera(image.camera_id)
             found[image.name] = (len(points), _pose_inliers(points, keypoints, camera, model, seed))

@@ -14,8 +14,8 @@ import pycolmap
 from jaxtyping import Float, Int
 
 from stages.contract import Note
-from stages.sfm.colmap.correspondences import read_pair_matches
 from stages.sfm.colmap.database.copies import copy_without_pairs, keep_inliers
+from stages.sfm.colmap.database.correspondences import read_pair_matches
 from stages.sfm.colmap.database.files import changed_copy
 from stages.sfm.colmap.mappers import map_incrementally
 from stages.sfm.colmap.models import load_native, write_native

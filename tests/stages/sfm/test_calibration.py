@@ -11,9 +11,9 @@ import pytest
 
 from stages.io.photos import Photo
 from stages.sfm.checked_mapping import calibrate_by_few
+from stages.sfm.colmap.database.calibration import set_focal_length
 from stages.sfm.colmap.database.images import fill_database
-from stages.sfm.colmap.database.matching import match_pairs
-from stages.sfm.colmap.thinning import best_linked, set_focal_length
+from stages.sfm.colmap.database.matching import best_linked, match_pairs
 from stages.sfm.retry_strategies import MappingOptions
 from tests.stages.sfm.pairs.test_feature_matching import random_descriptors
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
+from jaxtyping import Float
 
 from stages.hardware import cluster
 from stages.hardware.memory import available_bytes
@@ -41,7 +42,7 @@ class Features:
         """Those of the photo with this number, for work anywhere."""
         if (found := self._photos.pop(photo, None)) is None:
             camera = db.read_camera(db.read_image(photo + 1).camera_id)
-            keypoints = np.array(db.read_keypoints(photo + 1), float).reshape(-1, 6)[:, :2].copy()
+            keypoints = read_keypoints(db, photo + 1).copy()  # without the shapes beside them
             features: Any = read_descriptors(db, photo)
             if self._words is not None:
                 features = index_features(features, self._words)
@@ -58,6 +59,11 @@ class Features:
 def read_descriptors(db: pycolmap.Database, photo: int) -> np.ndarray:
     """Of the photo with this number, (keypoints, 128) bytes."""
     return np.array(db.read_descriptors(photo + 1).data, np.uint8).reshape(-1, 128)
+
+
+def read_keypoints(db: pycolmap.Database, image_id: int) -> Float[np.ndarray, "keypoints 2"]:
+    """Where an image's keypoints are, in pixels."""
+    return np.array(db.read_keypoints(image_id), float).reshape(-1, 6)[:, :2]
 
 
 def read_vocabulary(database: Path, count: int, seed: int, words: int) -> Words:

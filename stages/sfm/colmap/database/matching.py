@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from itertools import chain
+from itertools import chain, islice, takewhile
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,8 +13,10 @@ import pycolmap
 
 from stages.hardware import cluster
 from stages.hardware.device import processors
+from stages.sfm.colmap.database.correspondences import image_pairs
 from stages.sfm.colmap.database.features import Features, PhotoFeatures, SharedFeatures
 from stages.sfm.pairs.feature_matching import IndexedFeatures, match_descriptors, match_indexed
+from stages.sfm.pairs.match_graph import inlier_matrix, most_linked
 from stages.sfm.pairs.pair_selection import Pairs
 
 # Lowe's ratio: 0.8 is SIFT's own. 0.9 lets in many mismatches, most of which verification throws out again, and
@@ -151,4 +153,16 @@ def matched_pairs(database: Path) -> Pairs:
     """All pairs of photos that were matched so far, verified or not."""
     with pycolmap.Database.open(database) as db:
         ids, _ = db.read_all_matches()
-    return np.array([pycolmap.pair_id_to_image_pair(pair) for pair in ids], int).reshape(-1, 2) - 1
+    return image_pairs(ids) - 1
+
+
+def best_linked(database: Path, count: int) -> list[str]:
+    """The names of so many images that hang together by the most verified matches: the one that has most, then again
+    and again the one that has most with those taken. Fewer where no other is linked with them."""
+    with pycolmap.Database.open(database) as db:
+        names = [image.name for image in sorted(db.read_all_images(), key=lambda image: image.image_id)]
+        pair_ids, inliers = db.read_two_view_geometry_num_inliers()
+    graph = inlier_matrix(len(names), image_pairs(pair_ids) - 1, np.array(inliers, int))
+    strength = np.maximum(graph, 0)  # none where none was tried
+    linked = takewhile(lambda one: one.links > 0, most_linked(strength))
+    return [names[photo] for photo, _ in islice(linked, count)]

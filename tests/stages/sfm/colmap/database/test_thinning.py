@@ -1,15 +1,9 @@
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
-import pycolmap
-import pytest
 
-from stages.io.photos import Photo
-from stages.sfm.colmap import thinning
-from stages.sfm.colmap.correspondences import Correspondences
-from stages.sfm.colmap.database.images import MAPPING_MODEL, fill_database
-from stages.sfm.colmap.thinning import best_tracks, calibrate_focal_lengths
+from stages.sfm.colmap.database.correspondences import Correspondences
+from stages.sfm.colmap.database.thinning import best_tracks
 
 PHOTOS, KEYPOINTS = 4, 6
 
@@ -56,18 +50,6 @@ def test_a_track_that_sees_a_photo_twice_comes_last() -> None:
     twice = [(0, 3), (1, 3), (2, 3), (3, 3), (0, 4)]
     assert kept(matched(twice, MIDDLE), ONE_CELL, 1) == {*MIDDLE, *twice}  # all that photo 3 has
     assert kept(matched(twice, MIDDLE, [(3, 1), (2, 1)]), ONE_CELL, 1) == {*MIDDLE, (3, 1), (2, 1)}
-
-
-def test_told_focal_lengths_do_not_depend_on_timing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told = []
-    for name, rounding in (("one", 0.0), ("other", 3e-13)):
-        database = tmp_path / f"{name}.db"
-        fill_database(database, [Photo("a.png", "images/a.png", 1024, 768, 0, None, None, False, 1.0)], MAPPING_MODEL)
-        monkeypatch.setattr(thinning, "_calibrated", lambda _, start, by=rounding: {1: 1234.56789 * (1 + start * by)})
-        assert calibrate_focal_lengths(database)
-        with pycolmap.Database.open(database) as db:
-            told.append(db.read_camera(1).mean_focal_length())
-    assert told == [1234.57, 1234.57]
 
 
 def test_nothing_matched_keeps_nothing() -> None:

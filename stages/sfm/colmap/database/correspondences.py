@@ -1,11 +1,13 @@
-"""The verified matches of a database as arrays. Call it in a child process."""
+"""The verified matches of a database as arrays."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 from jaxtyping import Float, Int
 
+from stages.sfm.colmap.database.features import read_keypoints
 from stages.sfm.pose_check import MIN_PAIR_MATCHES, PairMatches
 
 MAX_MATCHES_CHECKED = 200  # of a pair, drawn by the seed: their median is known to a tenth of their spread
@@ -24,7 +26,7 @@ def read_correspondences(db: pycolmap.Database, geometries: dict[int, pycolmap.T
     """All verified matches, in order of ``geometries`` (by pair id)."""
     counts = [db.num_keypoints_for_image(i + 1) for i in range(db.num_images())]
     begins = np.concatenate([[0], np.cumsum(counts)]).astype(int)
-    pairs = np.array([pycolmap.pair_id_to_image_pair(pair_id) for pair_id in geometries], int).reshape(-1, 2)
+    pairs = image_pairs(geometries)
     inliers = [np.asarray(geometry.inlier_matches, int).reshape(-1, 2) for geometry in geometries.values()]
     return Correspondences(
         pairs,
@@ -32,6 +34,11 @@ def read_correspondences(db: pycolmap.Database, geometries: dict[int, pycolmap.T
         np.concatenate([np.zeros((0, 2), int), *(s + begins[p - 1] for s, p in zip(inliers, pairs, strict=True))]),
         begins,
     )
+
+
+def image_pairs(pair_ids: Iterable[int]) -> Int[np.ndarray, "pairs 2"]:
+    """The image ids of COLMAP's pair ids, the lower first."""
+    return np.array([pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids], int).reshape(-1, 2)
 
 
 def read_pair_matches(
@@ -45,7 +52,7 @@ def read_pair_matches(
     ids = sorted(model.reg_image_ids())
     number = {image_id: place for place, image_id in enumerate(ids)}
     random = np.random.default_rng(seed)
-    xy = {image_id: _keypoints(db, image_id) for image_id in ids}
+    xy = {image_id: read_keypoints(db, image_id) for image_id in ids}
     pairs, weights, keypoints, noise = [], [], [], []
     for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
         first, second = pycolmap.pair_id_to_image_pair(pair_id)
@@ -73,10 +80,6 @@ def read_pair_matches(
         focal_px=np.array([model.camera(model.image(i).camera_id).mean_focal_length() for i in ids]),
         pair_noise_px=np.array(noise, float),
     )
-
-
-def _keypoints(db: pycolmap.Database, image_id: int) -> Float[np.ndarray, "keypoints 2"]:
-    return np.array(db.read_keypoints(image_id), float).reshape(-1, 6)[:, :2]
 
 
 def _directions(xy: Float[np.ndarray, "keypoints 2"], camera: pycolmap.Camera) -> Float[np.ndarray, "keypoints 3"]:
