@@ -14,6 +14,7 @@ from pydantic import Field, field_validator
 from stages.contract import Auto, Flexible, Inputs, Progress, StageConfig, StageError, StageResult, Workload
 from stages.hardware.device import processors
 from stages.io.files import read_scene
+from stages.mesh.face_count import default_faces
 from stages.scale import metres_per_unit
 from stages.train import trained_seconds
 
@@ -30,7 +31,7 @@ FLEXIBLE = Flexible(share=0.12, min_seconds=8.0, max_seconds=60.0)
 TEXTURE_SECONDS, TEXTURE_SECONDS_PER_PHOTO = 5.0, 0.45
 # Of a refinement, of a core: for 100,000 faces, and for each photo that a texture would have looked through anyway.
 REFINEMENT_SECONDS, REFINEMENT_SECONDS_PER_PHOTO = 6.0, 0.2
-FACES, FACES_WITHOUT_TEXTURE = 100_000, 300_000  # by default, at least
+MEASURED_FACES = 100_000  # which REFINEMENT_SECONDS are for
 MIN_SHARE_OF_SHAPE = 0.3  # of a time limit, that refinement and texture leave
 
 Format = Literal["glb", "ply", "obj", "stl", "3mf"]
@@ -128,9 +129,9 @@ def _photo_seconds(config: Config, photos: int, cores: int) -> float:
     if textured:
         seconds += TEXTURE_SECONDS + TEXTURE_SECONDS_PER_PHOTO * photos / cores
     if config.refine:
-        faces = config.max_faces or (FACES if textured else FACES_WITHOUT_TEXTURE)
+        faces = config.max_faces or default_faces(0, textured)
         per_photo = 0.0 if textured else REFINEMENT_SECONDS_PER_PHOTO * photos
-        seconds += (REFINEMENT_SECONDS + per_photo) * faces / FACES / cores
+        seconds += (REFINEMENT_SECONDS + per_photo) * faces / MEASURED_FACES / cores
     return seconds
 
 

@@ -20,6 +20,7 @@ from stages.hardware.memory import available_bytes, check_memory
 from stages.io.field_files import load_field
 from stages.io.files import SMALL_COPY, read_scene, read_tensors, write_png, write_tensors
 from stages.mesh.cleaning import Cleaned, boundary, clean
+from stages.mesh.face_count import default_faces
 from stages.mesh.files import WRITERS, Z_UP_TO_Y_UP, ColouredMesh
 from stages.mesh.grid_space import (
     DensityIn,
@@ -46,8 +47,6 @@ if TYPE_CHECKING:
     from stages.mesh import Config
 
 ISO_LEVEL_RAYS = 1024
-# Faces by default (docs/experiments/mesh.md): leaves take many, walls few.
-MIN_FACES, MAX_FACES, FACES_KEPT = 100_000, 300_000, 0.25
 COLOUR_SAMPLES = 8  # through the two voxels around a vertex
 PRINTED = ("stl", "3mf")  # read in millimetres by the programs that print
 BYTES_PER_POINT = 20  # density, occupancy, its averages and marching cubes; 16 measured at 208³
@@ -156,7 +155,7 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
 
 def _decimated(config: "Config", surface: Surface, space: SpaceMap) -> Surface:
     """The surface with as many faces as asked for, more where it has many open borders."""
-    most = config.max_faces or default_faces(config, len(surface.faces))
+    most = config.max_faces or default_faces(len(surface.faces), config.texture_size > 0)
     decimated = decimate(surface, most, space)
     if not len(decimated.faces):
         raise StageError(
@@ -166,12 +165,6 @@ def _decimated(config: "Config", surface: Surface, space: SpaceMap) -> Surface:
             "Try more --mesh.max-faces, or --mesh.keep largest.",
         )
     return decimated
-
-
-def default_faces(config: "Config", found: int) -> int:
-    """How many of the faces ``found`` to keep. A smooth surface with a texture looks the same with fewer; without one,
-    each face shows a colour."""
-    return MAX_FACES if config.texture_size == 0 else min(MAX_FACES, max(MIN_FACES, round(FACES_KEPT * found)))
 
 
 def _cropped(config: "Config", surface: Surface, source: Source, progress: Progress) -> Surface:

@@ -18,6 +18,7 @@ from stages.contract import run_stage
 from stages.io.files import write_json, write_tensors
 from stages.mesh import extraction, preview, resolution, visibility
 from stages.mesh.extraction import vertex_colours
+from stages.mesh.face_count import default_faces
 from tests.refusals import refused
 from tests.stages.mesh.test_files import colours_of, upright_mesh
 
@@ -437,4 +438,4 @@ def test_colours_that_are_not_finite_are_refused(run_mesh, tmp_path):
     [(4096, 50_000, 100_000), (4096, 800_000, 200_000), (4096, 9_000_000, 300_000), (0, 50_000, 300_000)],
 )
 def test_faces_follow_texture_and_surface(size, found, kept):
-    assert extraction.default_faces(mesh.Config(texture_size=size), found) == kept
+    assert default_faces(found, textured=size > 0) == kept
