@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf import REGION_HALF_SIZE
-from nerf.geometry.reconstruction import Reconstruction
+from nerf.geometry.reconstruction import Reconstruction, observations_by_view
 
 MIN_POINTS_IN_VIEW = 10  # fewer say nothing about a photo's depth range; all photos together then do
 QUANTILES = (0.002, 0.5, 0.999)  # near, median and far distance of what a photo sees
@@ -51,12 +51,10 @@ def _points_range(scene: Reconstruction) -> tuple[Float[np.ndarray, "n"], Float[
         return np.full(count, np.nan), np.zeros(count)
     distances = scene.distances()
     sure = scene.points[np.bincount(scene.point, minlength=len(scene.points)) >= SURE_VIEWS]
-    by_view = np.argsort(scene.view, kind="stable")
-    begins = np.searchsorted(scene.view[by_view], np.arange(count + 1))
     of_all = np.quantile(distances, QUANTILES)
     near, far = np.empty(count), np.empty(count)
-    for view in range(count):
-        seen = distances[by_view[begins[view] : begins[view + 1]]]
+    for view, own in enumerate(observations_by_view(scene.view, count)):
+        seen = distances[own]
         low, middle, high = np.quantile(seen, QUANTILES) if len(seen) >= MIN_POINTS_IN_VIEW else of_all
         low = max(low, 0.05 / NEAR_MARGIN * middle)
         low, high = _widened(scene, view, sure, low, high)

@@ -82,6 +82,12 @@ class Reconstruction:
         return replace(self, from_camera=np.concatenate([axes, centres[:, :, None]], axis=2), points=points)
 
 
+def observations_by_view(view: Int[np.ndarray, "observations"], count: int) -> list[Int[np.ndarray, "seen"]]:
+    """Of each of ``count`` photos which observations are its own, in their order."""
+    order = np.argsort(view, kind="stable")
+    return np.split(order, np.searchsorted(view[order], np.arange(1, count)))
+
+
 def angles(vectors: Float[np.ndarray, "*m 3"]) -> Float[np.ndarray, "*m 2"]:
     """How far to the right and down of the optical axis vectors in a camera's frame point, in radians. A photo
     without distortion is a rectangle of them."""

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.sparse import csr_matrix
 
+from nerf.geometry.reconstruction import observations_by_view
 from nerf.geometry.scene import Scene, View
 from stages.contract import Inputs, StageError
 from stages.depth.consistency import SparseDepths
@@ -64,9 +65,8 @@ class TrainingPhotos:
     @cached_property
     def _observations(self) -> list[np.ndarray]:
         """Of each photo the numbers of its observations among those of the points."""
-        order = np.argsort(self.points["view"], kind="stable")
-        starts = np.searchsorted(self.points["view"][order], np.arange(len(self.scene.views) + 1))
-        return [order[starts[index] : starts[index + 1]] for index in self.scene.indices_of("train")]
+        of_views = observations_by_view(self.points["view"], len(self.scene.views))
+        return [of_views[index] for index in self.scene.indices_of("train")]
 
     @cached_property
     def views(self) -> tuple[View, ...]:
