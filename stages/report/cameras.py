@@ -230,7 +230,7 @@ def missing(registration: Mapping[str, Any] | None, name_of: Mapping[str, str]) 
 
 def camera_models(registration: Mapping[str, Any] | None) -> dict[str, Any]:
     """The comparison of camera models in stage sfm."""
-    from stages.sfm.colmap.camera_model_selection import NOISE_MULTIPLES
+    from stages.sfm.colmap.adjustment.camera_model_selection import NOISE_MULTIPLES
 
     rows = (registration or {}).get("camera_models", [])
     chosen = [f"{row['model']}, principal point {row['principal_point']}" for row in rows if row["chosen"]]

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 from stages.contract import Note
 from stages.sfm import global_mapping
+from stages.sfm.colmap.adjustment.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.database.calibration import MAX_EXIF_RATIO, far_apart
 from stages.sfm.colmap.database.images import adopt_cameras
 from stages.sfm.colmap.database.matching import best_linked
 from stages.sfm.colmap.database.thinning import thin_matches
 from stages.sfm.colmap.diagnosis import compare_models, disagree
-from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.joining import Piece, join_pieces
 from stages.sfm.colmap.mappers import incremental_options, map_globally, map_incrementally
 from stages.sfm.colmap.models import load_native

@@ -18,8 +18,8 @@ from stages.hardware import cluster
 from stages.io.amounts import rough_duration
 from stages.io.files import make_durable
 from stages.sfm.checked_mapping import register_missing, run_mapping
+from stages.sfm.colmap.adjustment.final_bundle_adjustment import final_bundle_adjustment
 from stages.sfm.colmap.diagnosis import find_conflict, links, supports
-from stages.sfm.colmap.final_bundle_adjustment import final_bundle_adjustment
 from stages.sfm.colmap.models import load_native, turned_upright, write_native
 from stages.sfm.colmap.repair import check_model, deregister, facts, reasons
 from stages.sfm.job import Job, JobState, Send, end_with_parent

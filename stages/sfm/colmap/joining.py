@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from nerf.geometry.alignment import fit_poses
 from nerf.geometry.scene import Similarity
-from stages.sfm.colmap.final_bundle_adjustment import release_focal_lengths
+from stages.sfm.colmap.adjustment.final_bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.repair import restricted
 from stages.sfm.pose_check import tolerance_px
 

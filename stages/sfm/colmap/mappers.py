@@ -54,8 +54,8 @@ def incremental_options(
 
     With ``hold_focal``, focal lengths that all pairs together tell are held: the first few images alone do not tell
     them from distortion and depth; where adjustment runs away with them, every image after these is placed wrongly.
-    :func:`~stages.sfm.colmap.final_bundle_adjustment.release_focal_lengths` is for afterwards. ``held_cameras`` (ids)
-    are kept as they are in the database, whatever becomes of the others.
+    ``release_focal_lengths`` (stages/sfm/colmap/adjustment) is for afterwards. ``held_cameras`` (ids) are kept as they
+    are in the database, whatever becomes of the others.
     """
     options = pipeline_options(seed + mapping.seed_offset)
     # Otherwise each photo is decoded as it is registered, in every mapping. Of thinned matches all points are coloured

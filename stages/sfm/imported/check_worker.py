@@ -21,10 +21,10 @@ from jaxtyping import Float
 
 from stages.ingest.masks import write_feature_masks
 from stages.io.photos import Photo
+from stages.sfm.colmap.adjustment.final_bundle_adjustment import adjust_lenses, adjust_poses
 from stages.sfm.colmap.database.extraction import ExtractionOptions, extract_features
 from stages.sfm.colmap.database.images import MAPPING_MODEL, fill_database
 from stages.sfm.colmap.database.matching import STRICT_RATIO, match_pairs, verified_matches
-from stages.sfm.colmap.final_bundle_adjustment import adjust_lenses, adjust_poses
 from stages.sfm.colmap.mappers import triangulate
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import Checked, camera_poses, check_model, facts

@@ -337,7 +337,7 @@ def test_one_degenerate_camera_does_not_end_the_run(
     images["photo_003.jpg"] = np.ascontiguousarray(images["photo_003.jpg"][:, 10:230])  # another size, another camera
     degenerate = "camera.width == 220" if always else "camera.width == 220 and camera.model_name != 'SIMPLE_PINHOLE'"
     child = (
-        "import stages.sfm.colmap.intrinsics as lenses, stages.sfm.worker as c\n"
+        "import stages.sfm.colmap.adjustment.intrinsics as lenses, stages.sfm.worker as c\n"
         f"lenses.why_degenerate = lambda camera: 'it is wrong' if {degenerate} else None\n"
         "c.main()"
     )

@@ -2,7 +2,7 @@
 
 Bundle adjustment takes time with the observations, and hundreds of photos have far more than their poses need. Long
 tracks tie many photos together; where structure repeats, chance matches make short ones. Mapping works on these, and
-the final bundle adjustment brings back all matches (stages/sfm/colmap/final_bundle_adjustment.py).
+the final bundle adjustment brings back all matches (stages/sfm/colmap/adjustment/final_bundle_adjustment.py).
 """
 
 from pathlib import Path

@@ -8,9 +8,9 @@ import pytest
 from nerf.geometry.scene import Camera
 from nerf.synthetic.scenes import ring_of_cameras
 from stages.io.sparse_model import SparseImage, SparseModel
+from stages.sfm.colmap.adjustment.intrinsics import why_degenerate
 from stages.sfm.colmap.cameras import camera_rays, is_valid, native, project, rescaled
 from stages.sfm.colmap.diagnosis import find_conflict
-from stages.sfm.colmap.intrinsics import why_degenerate
 from stages.sfm.colmap.models import load_native, read_model, write_model
 from tests.refusals import refused
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pycolmap
 
+from stages.sfm.colmap.adjustment.observations import observations, residuals
 from stages.sfm.colmap.cameras import pixel_map
 from stages.sfm.colmap.models import turned_upright
-from stages.sfm.colmap.observations import observations, residuals
-from tests.stages.sfm.colmap.lens_scene import HEIGHT, WIDTH, lens, photographed
+from tests.stages.sfm.colmap.adjustment.lens_scene import HEIGHT, WIDTH, lens, photographed
 
 LENS = lens("OPENCV", 900, 910, 460, 290, 0.02, -0.01, 0.003, -0.002)
 TURNS = {"02.jpg": 1, "03.jpg": 2, "04.jpg": 3, "05.jpg": 1}

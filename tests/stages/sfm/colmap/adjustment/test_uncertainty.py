@@ -7,12 +7,12 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from stages.contract import Note
-from stages.sfm.colmap import uncertainty
-from stages.sfm.colmap.camera_model_selection import CameraModels
-from stages.sfm.colmap.final_bundle_adjustment import _finished
-from stages.sfm.colmap.observations import MIN_NOISE_PX, noise_px, observations
-from stages.sfm.colmap.uncertainty import _error_px, pose_uncertainty_px
-from tests.stages.sfm.colmap.lens_scene import adjust, lens, photographed
+from stages.sfm.colmap.adjustment import uncertainty
+from stages.sfm.colmap.adjustment.camera_model_selection import CameraModels
+from stages.sfm.colmap.adjustment.final_bundle_adjustment import _finished
+from stages.sfm.colmap.adjustment.observations import MIN_NOISE_PX, noise_px, observations
+from stages.sfm.colmap.adjustment.uncertainty import _error_px, pose_uncertainty_px
+from tests.stages.sfm.colmap.adjustment.lens_scene import adjust, lens, photographed
 
 CAMERA = lens("SIMPLE_RADIAL", 800, 450, 300, -0.1)
 PHOTOS, POINTS = 6, 80

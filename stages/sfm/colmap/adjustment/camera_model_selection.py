@@ -17,8 +17,8 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
 
 from stages.contract import Note
-from stages.sfm.colmap.intrinsics import MODELS, CameraModelCandidate, degenerate_cameras, set_camera_models
-from stages.sfm.colmap.observations import Observations, noise_px, observations, residuals
+from stages.sfm.colmap.adjustment.intrinsics import MODELS, CameraModelCandidate, degenerate_cameras, set_camera_models
+from stages.sfm.colmap.adjustment.observations import Observations, noise_px, observations, residuals
 from stages.sfm.pairs.match_graph import most_linked
 
 # Points for the comparison are drawn until they have so many observations: 14 candidates then take seconds.

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from nerf.geometry.scene import Camera
-from stages.sfm.colmap import final_bundle_adjustment, intrinsics
-from stages.sfm.colmap.camera_model_selection import CameraModels, best_covered, choose, hold_out, paired
+from stages.sfm.colmap.adjustment import final_bundle_adjustment, intrinsics
+from stages.sfm.colmap.adjustment.camera_model_selection import CameraModels, best_covered, choose, hold_out, paired
+from stages.sfm.colmap.adjustment.intrinsics import MODELS, CameraModelCandidate, set_camera_models, why_degenerate
+from stages.sfm.colmap.adjustment.observations import noise_px, observations, residuals
 from stages.sfm.colmap.cameras import native
-from stages.sfm.colmap.intrinsics import MODELS, CameraModelCandidate, set_camera_models, why_degenerate
-from stages.sfm.colmap.observations import noise_px, observations, residuals
 from tests.refusals import codes
-from tests.stages.sfm.colmap.lens_scene import HEIGHT, WIDTH, adjust, lens, mapped, photographed
+from tests.stages.sfm.colmap.adjustment.lens_scene import HEIGHT, WIDTH, adjust, lens, mapped, photographed
 
 if TYPE_CHECKING:
     import pycolmap
@@ -70,7 +70,7 @@ def test_many_photos_are_judged_by_the_best_covered(monkeypatch: pytest.MonkeyPa
     some = best_covered(model, 5)
     assert len(some) == 5 and some < everyone and best_covered(model, 5) == some
     assert best_covered(model, 1000) == everyone
-    monkeypatch.setattr("stages.sfm.colmap.camera_model_selection.MAX_PHOTOS", 5)
+    monkeypatch.setattr("stages.sfm.colmap.adjustment.camera_model_selection.MAX_PHOTOS", 5)
     choice = choose(model, seed=0)
     assert {row["photos"] for row in choice.table} == {len(everyone)}, "of all these photos the camera is chosen"
     assert len(set(model.reg_image_ids())) == len(everyone), "the model itself stays"

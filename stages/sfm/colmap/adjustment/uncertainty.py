@@ -8,7 +8,7 @@ from scipy.sparse import bsr_matrix
 
 from stages.hardware.memory import available_bytes
 from stages.io.amounts import bytes_in_words
-from stages.sfm.colmap.observations import Observations, observations, points_in_camera, residuals
+from stages.sfm.colmap.adjustment.observations import Observations, observations, points_in_camera, residuals
 
 MIN_OBSERVATIONS = 6  # of a photo: 12 equations for 6 unknowns; with fewer its pose is not known
 MATRICES = 6  # of 6 n × 6 n float64 for n photos, that are there at once at most

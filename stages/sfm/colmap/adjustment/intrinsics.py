@@ -9,8 +9,8 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from stages.ingest.exif import FOCAL_RANGE
+from stages.sfm.colmap.adjustment.observations import observations, points_in_camera
 from stages.sfm.colmap.cameras import is_fisheye, share_without_ray, why_no_ray
-from stages.sfm.colmap.observations import observations, points_in_camera
 
 MODELS = (
     "SIMPLE_PINHOLE",

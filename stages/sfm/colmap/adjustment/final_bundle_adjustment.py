@@ -10,12 +10,12 @@ import pycolmap
 
 from nerf.geometry.alignment import align_poses
 from stages.contract import Note
-from stages.sfm.colmap.camera_model_selection import CameraModels, adjustment_options, choose
-from stages.sfm.colmap.intrinsics import MODELS, degenerate_cameras, set_camera_models
+from stages.sfm.colmap.adjustment.camera_model_selection import CameraModels, adjustment_options, choose
+from stages.sfm.colmap.adjustment.intrinsics import MODELS, degenerate_cameras, set_camera_models
+from stages.sfm.colmap.adjustment.observations import noise_px, observations
+from stages.sfm.colmap.adjustment.uncertainty import pose_uncertainty_px
 from stages.sfm.colmap.mappers import pipeline_options, triangulated
 from stages.sfm.colmap.models import load_native, read_model, write_model, write_native
-from stages.sfm.colmap.observations import noise_px, observations
-from stages.sfm.colmap.uncertainty import pose_uncertainty_px
 
 # The first choice can only go by the observations that fit mapping's camera model. Where those of another one are a
 # tenth more, mostly at the borders of wide photos, these tell the models apart.
