@@ -24,8 +24,8 @@ from stages.sfm.colmap.database.extraction import ExtractionOptions, extract_fea
 from stages.sfm.colmap.database.features import Features, image_similarity, read_vocabulary
 from stages.sfm.colmap.database.images import MAPPING_MODEL, fill_database
 from stages.sfm.colmap.database.matching import STRICT_RATIO, match_pairs
+from stages.sfm.colmap.model_check import ModelCheck, camera_poses, check_model
 from stages.sfm.colmap.models import load_native
-from stages.sfm.colmap.repair import Checked, camera_poses, check_model
 from stages.sfm.pairs.image_retrieval import CELLS
 from stages.sfm.pairs.match_graph import connected, natural_order, pairs_apart
 from stages.sfm.pairs.pair_selection import nearest, union
@@ -73,7 +73,7 @@ def main() -> None:
     )
 
 
-def right_model(ingest: Path, sparse: Path, database: Path | None) -> tuple[Checked, np.ndarray, float, list[str]]:
+def right_model(ingest: Path, sparse: Path, database: Path | None) -> tuple[ModelCheck, np.ndarray, float, list[str]]:
     """The check of the model as it is, poses, usual depth of points and names of its photos."""
     model = load_native(sparse)
     registered = {model.image(i).name for i in model.reg_image_ids()}
@@ -100,7 +100,7 @@ def match(database: Path, images: Path, photos: Sequence[Photo]) -> None:
     match_pairs(database, pairs, 0, STRICT_RATIO, features=features)
 
 
-def moved(checked: Checked, poses: np.ndarray, depth: float, order: np.ndarray, count: int) -> "Sequence[Move]":
+def moved(checked: ModelCheck, poses: np.ndarray, depth: float, order: np.ndarray, count: int) -> "Sequence[Move]":
     """Groups moved one after the other, until so many photos were."""
     random, moves = np.random.default_rng(0), []
     step = float(np.median(np.linalg.norm(np.diff(poses[order, :, 3], axis=0), axis=1)))
@@ -128,7 +128,7 @@ def moved(checked: Checked, poses: np.ndarray, depth: float, order: np.ndarray, 
     return moves
 
 
-def linked_without(group: np.ndarray, checked: Checked) -> np.ndarray:
+def linked_without(group: np.ndarray, checked: ModelCheck) -> np.ndarray:
     """Which photos agreeing pairs link to most others, none of them of the group."""
     pairs = checked.matches.pairs[checked.check.agrees & ~np.isin(checked.matches.pairs, group).any(axis=1)]
     linked = np.zeros((len(checked.ids), len(checked.ids)), bool)

@@ -20,12 +20,12 @@ import numpy as np
 import pycolmap
 
 from benchmarks.record import Record, add_out
-from stages.sfm.colmap.adjustment.final_bundle_adjustment import release_focal_lengths
+from stages.sfm.colmap.adjustment.bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.database.calibration import set_focal_length
 from stages.sfm.colmap.database.matching import verify_again
 from stages.sfm.colmap.database.thinning import thin_matches
 from stages.sfm.colmap.mappers import incremental_options, map_incrementally
-from stages.sfm.colmap.repair import check_model
+from stages.sfm.colmap.model_check import check_model
 from stages.sfm.retry_strategies import STRATEGIES
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from stages.contract import Note
 from stages.sfm import global_mapping
-from stages.sfm.colmap.adjustment.final_bundle_adjustment import release_focal_lengths
+from stages.sfm.colmap.adjustment.bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.database.calibration import MAX_EXIF_RATIO, far_apart
 from stages.sfm.colmap.database.images import adopt_cameras
 from stages.sfm.colmap.database.matching import best_linked
@@ -16,21 +16,18 @@ from stages.sfm.colmap.database.thinning import thin_matches
 from stages.sfm.colmap.diagnosis import compare_models, disagree
 from stages.sfm.colmap.joining import Piece, join_pieces
 from stages.sfm.colmap.mappers import incremental_options, map_globally, map_incrementally
-from stages.sfm.colmap.models import load_native
-from stages.sfm.colmap.repair import (
+from stages.sfm.colmap.model_check import (
     Candidate,
     agreeing_pairs,
     better,
     check_model,
-    copy_consistent_matches,
-    deregister,
-    drop_outside_main_segment,
     fragments_sequence,
     reasons,
-    register_again,
     supported_runs,
     supported_steps,
 )
+from stages.sfm.colmap.models import load_native
+from stages.sfm.colmap.repair import copy_consistent_matches, deregister, drop_outside_main_segment, register_again
 from stages.sfm.job import JobState
 from stages.sfm.matching import capture_sequence, consecutive_pairs
 from stages.sfm.retry_strategies import MIN_MISSING_TO_START_OVER, STRATEGIES, MappingOptions, Strategy

@@ -20,8 +20,9 @@ from stages.io.files import make_durable
 from stages.sfm.checked_mapping import register_missing, run_mapping
 from stages.sfm.colmap.adjustment.final_bundle_adjustment import final_bundle_adjustment
 from stages.sfm.colmap.diagnosis import find_conflict, links, supports
+from stages.sfm.colmap.model_check import check_model, facts, reasons
 from stages.sfm.colmap.models import load_native, turned_upright, write_native
-from stages.sfm.colmap.repair import check_model, deregister, facts, reasons
+from stages.sfm.colmap.repair import deregister
 from stages.sfm.job import Job, JobState, Send, end_with_parent
 from stages.sfm.matching import capture_sequence, match_photos
 from stages.sfm.retry_strategies import (

@@ -1,8 +1,12 @@
 """Everything that is done with COLMAP: the only package that imports pycolmap.
 
-COLMAP is native code that can abort, so the steps of structure-from-motion (database.py, mapping.py,
-final_bundle_adjustment.py) run in a worker process (stages/sfm/worker.py); cameras.py and models.py are safe to call
-anywhere.
+``database``: features and matches. ``mappers``: models of them. ``model_check``: whether a model agrees with its
+matches; ``repair`` and ``joining`` make a better one where it does not. ``diagnosis``: what a model lacks, and why.
+``adjustment``: cameras, poses and points adjusted. ``models``: models on disk. ``cameras``: pixels to rays and back.
+
+COLMAP is native code that can abort, so it runs in worker processes (stages/sfm/worker.py and others). Safe to call
+anywhere are cameras.py and, in models.py, what reads and writes a SparseModel. *Native* is COLMAP's own object or file,
+as opposed to our Camera and SparseModel.
 
 Image ids are 1 + the position of the photo in order of ``file``; an image, its frame and its COLMAP name belong
 together (COLMAP's rigs and frames are trivial here: one camera each).

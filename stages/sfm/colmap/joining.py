@@ -1,9 +1,9 @@
 """Pieces of a broken sequence, joined where they share photos. Call it in a worker process.
 
 Where a sequence hangs by one step from photo to photo, incremental mapping ends in several models, and within a model
-a step that its own matches do not support ends a piece (:func:`~stages.sfm.colmap.repair.supported_runs`). What two
-pieces share is known however much a place repeats itself: a photo was taken in one position. So they are joined by
-photos that both have, never by matches between them, which repeated structure makes as well.
+a step that its own matches do not support ends a piece (``supported_runs`` in model_check.py). What two pieces share is
+known however much a place repeats itself: a photo was taken in one position. So they are joined by photos that both
+have, never by matches between them, which repeated structure makes as well.
 """
 
 from collections.abc import Iterable, Sequence
@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from nerf.geometry.alignment import fit_poses
 from nerf.geometry.scene import Similarity
-from stages.sfm.colmap.adjustment.final_bundle_adjustment import release_focal_lengths
+from stages.sfm.colmap.adjustment.bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.repair import restricted
 from stages.sfm.pose_check import tolerance_px
 
@@ -33,9 +33,8 @@ class Piece(NamedTuple):
 def join_pieces(pieces: Iterable[Piece], camera_is_known: bool) -> pycolmap.Reconstruction | None:
     """The longest piece with all others that can be joined to it, adjusted together; None where none can.
 
-    A piece is joined if it shares at least MIN_SHARED
-    photos, every one of them has the same pose in both after a similarity, and another scale would show. Where photos
-    are that both have, the longer piece says.
+    A piece is joined if it shares at least MIN_SHARED photos, every one of them has the same pose in both after a
+    similarity, and another scale would show. Where photos are that both have, the longer piece says.
     """
     by_length = sorted(pieces, key=lambda piece: len(piece.image_ids), reverse=True)
     waiting = [restricted(*piece) for piece in by_length if len(piece.image_ids) > MIN_SHARED]

@@ -1,16 +1,13 @@
-"""From matches to sub-models: incremental and global mapping, points at known poses. Call it in a worker process."""
+"""From matches to sub-models: incremental and global mapping. Call it in a worker process."""
 
 from collections.abc import Callable, Collection
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pycolmap
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from stages.sfm.colmap.database.copies import copy_with_cameras_of
-from stages.sfm.colmap.models import load_native, write_native
 from stages.sfm.retry_strategies import MIN_POSE_INLIERS, MappingOptions
 
 MIN_MODEL_IMAGES = 3
@@ -98,38 +95,6 @@ def map_globally(
     for model in found.values():
         _keep_largest_group(model)
     return sorted(found.values(), key=_rank, reverse=True)
-
-
-def triangulate(
-    sparse: Path, database: Path, images: Path, target: Path, excluded: Collection[int], limit_px: float
-) -> int:
-    """Write to the folder ``target`` the model in ``sparse``, with the database's image ids, with the points that
-    verified matches tell at its poses, which stay, as its cameras do; observations are at most ``limit_px`` off. The
-    images ``excluded`` (ids) take no part. The number of points; nothing is written where there are none.
-    """
-    model = load_native(sparse)
-    for image_id in excluded:
-        model.deregister_frame(model.image(image_id).frame_id)
-    if model.num_reg_images() > 1:
-        model = triangulated(model, database, images, limit_px)
-    if model.num_points3D():
-        write_native(target, model)
-    return model.num_points3D()
-
-
-def triangulated(
-    model: pycolmap.Reconstruction, database: Path, images: Path, limit_px: float, colours: bool = True
-) -> pycolmap.Reconstruction:
-    """The model, with the database's image ids, with points at its poses; observations are at most ``limit_px`` off."""
-    options = pipeline_options(0)
-    options.extract_colors = colours
-    options.mapper.filter_max_reproj_error = limit_px
-    options.triangulation.complete_max_reproj_error = limit_px
-    options.triangulation.merge_max_reproj_error = limit_px
-    with TemporaryDirectory(dir=database.parent) as scratch:
-        own = Path(scratch, "database.db")
-        copy_with_cameras_of(model, database, own)
-        return pycolmap.triangulate_points(model, own, images, scratch, options=options)
 
 
 def _keep_largest_group(model: pycolmap.Reconstruction) -> None:

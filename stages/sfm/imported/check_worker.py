@@ -21,13 +21,12 @@ from jaxtyping import Float
 
 from stages.ingest.masks import write_feature_masks
 from stages.io.photos import Photo
-from stages.sfm.colmap.adjustment.final_bundle_adjustment import adjust_lenses, adjust_poses
+from stages.sfm.colmap.adjustment.imported_models import adjust_intrinsics, adjust_poses, triangulate
 from stages.sfm.colmap.database.extraction import ExtractionOptions, extract_features
 from stages.sfm.colmap.database.images import MAPPING_MODEL, fill_database
 from stages.sfm.colmap.database.matching import STRICT_RATIO, match_pairs, verified_matches
-from stages.sfm.colmap.mappers import triangulate
+from stages.sfm.colmap.model_check import ModelCheck, camera_poses, check_model, facts
 from stages.sfm.colmap.models import load_native
-from stages.sfm.colmap.repair import Checked, camera_poses, check_model, facts
 from stages.sfm.imported.conventions import MIN_PAIRS, best_fit, fit_of_some
 from stages.sfm.imported.focal_lengths import fitting_focal_factor
 from stages.sfm.pairs.match_graph import MIN_INLIERS, natural_order, pairs_apart
@@ -40,7 +39,7 @@ PARTNERS = 6  # of each photo
 MAX_NAME_STEPS = 2  # positions before and after it, in the order of names
 MAX_ERROR_PX = 4.0  # of an observation, as in mapping, on photos of MAX_IMAGE_SIZE; more on larger ones
 MAX_DOUBTFUL = 0.05  # of the photos: more that contradict their poses make poses worth an adjustment
-LENS_MARGIN = 1.5  # times the error after adjusting poses: lenses that explain the matches so well are to blame
+INTRINSICS_MARGIN = 1.5  # × the error after adjusting poses: intrinsics that explain matches so well are to blame
 ADJUSTED, POINTS = "adjusted", "points"  # folders of models: with adjusted poses, with points
 TURN_DEG = 30.0  # two photos whose axes differ by so much count as far apart as two whose centres are usual neighbours
 
@@ -56,9 +55,9 @@ def check_imported_poses(
     """Check the model in ``folder/sparse``, whose images are these photos in order of ``file``. ``of_quaternions``: its
     poses stood as quaternions in a text file, which somebody may have written in another order.
 
-    Returns what :func:`stages.sfm.colmap.repair.facts` says, with the ``fit`` of another convention where the poses
-    contradict their photos and it does not, and the ``focal_fit`` of other focal lengths; or {"failed": why} where
-    nothing could be compared. The model stays as it is. Where it has no points,
+    Returns what ``facts`` (stages/sfm/colmap/model_check.py) says, with the ``fit`` of another convention where the
+    poses contradict their photos and it does not, and the ``focal_fit`` of other focal lengths; or {"failed": why}
+    where nothing could be compared. The model stays as it is. Where it has no points,
 
     * inexact poses are adjusted to the matches, if ``adjust``. Where they fit then, ``folder/adjusted`` is a model of
       all photos with these poses, and ``adjusted_from_px`` the error before; else that is None;
@@ -151,7 +150,7 @@ def _match(photos: list[Photo], images: Path, poses: Float[np.ndarray, "photos 3
 
 
 def _other_conventions(
-    found: dict[str, Any], checked: Checked, poses: Float[np.ndarray, "photos 3 4"], of_quaternions: bool
+    found: dict[str, Any], checked: ModelCheck, poses: Float[np.ndarray, "photos 3 4"], of_quaternions: bool
 ) -> dict[str, Any]:
     """Another convention and other focal lengths that fit the matches, where the poses as given do not."""
     fit = None if _mostly_agree(found) else best_fit(checked.matches, poses, of_quaternions)
@@ -164,18 +163,18 @@ def _other_conventions(
 def _adjusted(
     sparse: Path, database: Path, images: Path, target: Path, found: dict[str, Any], limit_px: float
 ) -> tuple[dict[str, Any], list[int]] | None:
-    """Adjust the poses, and judge again; None where they do not fit well then, or where it is the lenses: poses would
-    bend to what other intrinsics explain about as well."""
-    error_px, lenses = found["error_px"], database.with_name("lenses")
+    """Adjust the poses, and judge again; None where they do not fit well then, or where intrinsics are to blame: poses
+    would bend to what other intrinsics explain about as well."""
+    error_px, other = found["error_px"], database.with_name("intrinsics")
     if not adjust_poses(sparse, database, images, target, error_px, limit_px):
         return None
     model = load_native(target)
     checked = check_model(model, database, 0)
     again = facts(model, checked)
     if _fit_well(again) and again["error_px"] < error_px:
-        tried = adjust_lenses(sparse, database, images, lenses, error_px, limit_px)
-        of_lenses = check_model(load_native(lenses), database, 0).check.median_px if tried else np.inf
-        if of_lenses > LENS_MARGIN * again["error_px"]:
+        tried = adjust_intrinsics(sparse, database, images, other, error_px, limit_px)
+        of_intrinsics = check_model(load_native(other), database, 0).check.median_px if tried else np.inf
+        if of_intrinsics > INTRINSICS_MARGIN * again["error_px"]:
             return again, checked.failed()
     shutil.rmtree(target)
     return None

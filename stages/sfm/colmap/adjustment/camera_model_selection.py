@@ -1,4 +1,4 @@
-"""Which camera model the photos call for, by the error of observations that were held out. Call it in a child process.
+"""Which camera model the photos call for, by the error of observations that were held out. Call it in a worker process.
 
 Every candidate adjusts cameras, poses and points to most observations and predicts the others. The simplest one is
 chosen whose error exceeds the best one's by no more than the noise of the comparison, or by next to nothing. A camera
@@ -17,7 +17,13 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
 
 from stages.contract import Note
-from stages.sfm.colmap.adjustment.intrinsics import MODELS, CameraModelCandidate, degenerate_cameras, set_camera_models
+from stages.sfm.colmap.adjustment.bundle_adjustment import adjustment_options, bundle_adjust
+from stages.sfm.colmap.adjustment.intrinsics import (
+    CAMERA_MODELS,
+    CameraModelCandidate,
+    degenerate_cameras,
+    set_camera_models,
+)
 from stages.sfm.colmap.adjustment.observations import Observations, noise_px, observations, residuals
 from stages.sfm.pairs.match_graph import most_linked
 
@@ -27,11 +33,10 @@ MAX_PHOTOS = 150  # for each camera, those that share most points: more make the
 MAX_OBSERVATIONS_PER_IMAGE = 100  # where there are hundreds of photos it takes more: a pose alone has 6 unknowns
 MIN_HELD_OUT = 50  # the spread of so many is known to a tenth, 1/√(2 · 50); fewer are no evidence
 CAP_PX = 4.0  # what is farther off is a mismatch, as for COLMAP's own filter, and counts as this
-CELLS = 4  # neighbours in a photo err alike, so the noise is that of the means of 4 × 4 parts of each photo
+CELLS_ACROSS = 4  # neighbours in a photo err alike, so the noise is that of the means of 4 × 4 parts of each photo
 MAX_ITERATIONS = 50
-MAX_DEGENERATE_FRACTION = (
-    0.2  # of the photos may have degenerate cameras: these are put right in the end, and decide for no others
-)
+# Of the photos, that may have degenerate cameras: these are put right in the end, and decide for no others.
+MAX_DEGENERATE_FRACTION = 0.2
 # A bend of a twentieth of the observations' noise adds a thousandth to their error. Many observations tell less than
 # that from chance, and it means nothing.
 MIN_WORSE = 0.001
@@ -67,7 +72,7 @@ class CameraModels:
     notes: list[Note] = field(default_factory=list)
 
 
-def choose(mapped: pycolmap.Reconstruction, seed: int, models: Sequence[str] = MODELS) -> CameraModels:
+def choose(mapped: pycolmap.Reconstruction, seed: int, camera_models: Sequence[str] = CAMERA_MODELS) -> CameraModels:
     """The model of every camera, one of these.
 
     A camera is judged by its own photos alone where they share enough points, and the others all together, each
@@ -76,12 +81,12 @@ def choose(mapped: pycolmap.Reconstruction, seed: int, models: Sequence[str] = M
     """
     cameras = sorted({mapped.image(i).camera_id for i in mapped.reg_image_ids()})
     noise = noise_px(mapped, observations(mapped))
-    selections = [_select(mapped, group, seed, models, noise) for group in _groups(mapped, cameras)]
+    selections = [_select(mapped, group, seed, camera_models, noise) for group in _groups(mapped, cameras)]
     judged = [selection for selection in selections if selection.chosen]
     if len(judged) > 1 and len({selection.chosen.candidate for selection in judged if selection.chosen}) == 1:
         alike = sorted(camera for selection in judged for camera in selection.cameras)
         rest = [selection for selection in selections if not selection.chosen]
-        selections = [_select(mapped, alike, seed, models, noise), *rest]
+        selections = [_select(mapped, alike, seed, camera_models, noise), *rest]
     largest = max((one for one in selections if one.chosen), key=lambda one: one.photos, default=None)
     choice = CameraModels(largest.chosen.noise_px if largest and largest.chosen else noise)
     for index, (group, photos, chosen, rows, why) in enumerate(selections):
@@ -89,14 +94,14 @@ def choose(mapped: pycolmap.Reconstruction, seed: int, models: Sequence[str] = M
         choice.chosen |= dict.fromkeys(group, candidate)
         choice.table += [row | {"group": index, "photos": photos} for row in rows]
         whose = f"{photos} photo{'s' * (photos != 1)}: " if len(selections) > 1 else ""
-        given = " as given" if len(models) == 1 else ""
+        given = " as given" if len(camera_models) == 1 else ""
         which = f"camera model {candidate.model}{given}, principal point {candidate.principal_point_state}"
         choice.notes.append(Note("sfm.camera-model", f"{whose}{which}: {why}"))
     return choice
 
 
 def _select(
-    mapped: pycolmap.Reconstruction, cameras: list[int], seed: int, models: Sequence[str], noise: float
+    mapped: pycolmap.Reconstruction, cameras: list[int], seed: int, camera_models: Sequence[str], noise: float
 ) -> Selection:
     """Let every candidate predict what these cameras saw."""
     sample = _part(mapped, cameras)
@@ -109,7 +114,7 @@ def _select(
         if photos < 3:  # however many points there are
             why = "comparing camera models takes points that three photos of one camera see"
         return Selection(cameras, photos, None, [], why)
-    results = list(_results(sample, held_out, models, noise))
+    results = list(_results(sample, held_out, camera_models, noise))
     cells = _cells(held_out, mapped)
     chosen, rows = _choose(results, cells)
     return Selection(cameras, photos, chosen, rows, _reason(chosen, results, cells))
@@ -190,52 +195,28 @@ def _cells(seen: Observations, model: pycolmap.Reconstruction) -> Int[np.ndarray
     """In which part of which photo an observation lies."""
     size = {i: (c.width, c.height) for i in model.reg_image_ids() for c in [model.camera(model.image(i).camera_id)]}
     part = seen.xy / np.array([size[i] for i in seen.image.tolist()], float).reshape(-1, 2)
-    column, row = np.clip((CELLS * part).astype(np.int64), 0, CELLS - 1).T
-    return (seen.image * CELLS + row) * CELLS + column
+    column, row = np.clip((CELLS_ACROSS * part).astype(np.int64), 0, CELLS_ACROSS - 1).T
+    return (seen.image * CELLS_ACROSS + row) * CELLS_ACROSS + column
 
 
 def _results(
-    sample: pycolmap.Reconstruction, held_out: Observations, models: Sequence[str], noise: float
+    sample: pycolmap.Reconstruction, held_out: Observations, camera_models: Sequence[str], noise: float
 ) -> Iterator[CandidateResult]:
     """Every candidate adjusted to the sample; with a refined principal point it goes on from where it was centred."""
     trained = observations(sample)
     cameras = sorted({sample.image(i).camera_id for i in sample.reg_image_ids()})
-    _adjust(sample, False, noise)  # most of the way is the same for all candidates
-    for name in models:
+    # Most of the way is the same for all candidates.
+    bundle_adjust(sample, set(), adjustment_options(False, noise), MAX_ITERATIONS)
+    for name in camera_models:
         model = pycolmap.Reconstruction(sample)
         set_camera_models(model, dict.fromkeys(cameras, name))
         for principal_point in (False, True):
-            _adjust(model, principal_point, noise)
+            bundle_adjust(model, set(), adjustment_options(principal_point, noise), MAX_ITERATIONS)
             length = np.linalg.norm(residuals(model, held_out), axis=1)
             error = np.where(length < CAP_PX, length, CAP_PX)  # a point behind the camera (NaN) counts as far off
             degenerate = list(degenerate_cameras(model).values())
             why = degenerate[0] if len(degenerate) > MAX_DEGENERATE_FRACTION * model.num_reg_images() else None
             yield CandidateResult(CameraModelCandidate(name, principal_point), error, noise_px(model, trained), why)
-
-
-def _adjust(model: pycolmap.Reconstruction, principal_point: bool, noise: float) -> None:
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in sorted(model.reg_image_ids()):
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    options = adjustment_options(principal_point, noise)
-    options.ceres.solver_options.max_num_iterations = MAX_ITERATIONS
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-
-
-def adjustment_options(principal_point: bool, noise: float) -> pycolmap.BundleAdjustmentOptions:
-    """Of comparison and final adjustment alike.
-
-    Residuals r count by soft-L1, 2s²(√(1 + (r/s)²) − 1), with s the ``noise`` of the observations: beyond it their
-    gradient grows no more, so that the mismatches that remain do not bend the cameras. Were the noise
-    Gaussian, this would cost 7 % of its efficiency (Huber 1981, section 7.6: E[ψ']² / E[ψ²] in two dimensions).
-    """
-    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=principal_point, print_summary=False)
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.loss_function_scale = noise
-    options.ceres.solver_options.function_tolerance = 1e-6
-    options.ceres.solver_options.num_threads = 1
-    return options
 
 
 def _choose(

@@ -1,35 +1,32 @@
-"""The final adjustment of cameras and points, and of imported poses. Call it in a child process."""
+"""The final bundle adjustment of cameras, poses and points, with the camera model that the observations call for. Call
+it in a worker process."""
 
-from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 
-from nerf.geometry.alignment import align_poses
 from stages.contract import Note
-from stages.sfm.colmap.adjustment.camera_model_selection import CameraModels, adjustment_options, choose
-from stages.sfm.colmap.adjustment.intrinsics import MODELS, degenerate_cameras, set_camera_models
+from stages.sfm.colmap.adjustment.bundle_adjustment import adjustment_options, bundle_adjust
+from stages.sfm.colmap.adjustment.camera_model_selection import CameraModels, choose
+from stages.sfm.colmap.adjustment.intrinsics import CAMERA_MODELS, degenerate_cameras, set_camera_models
 from stages.sfm.colmap.adjustment.observations import noise_px, observations
 from stages.sfm.colmap.adjustment.uncertainty import pose_uncertainty_px
-from stages.sfm.colmap.mappers import pipeline_options, triangulated
-from stages.sfm.colmap.models import load_native, read_model, write_model, write_native
+from stages.sfm.colmap.mappers import pipeline_options
 
 # The first choice can only go by the observations that fit mapping's camera model. Where those of another one are a
 # tenth more, mostly at the borders of wide photos, these tell the models apart.
 MIN_GROWTH_TO_CHOOSE_AGAIN = 1.1
-SIMPLEST = MODELS[0]
-MAX_ERROR_MULTIPLE = 5.0  # of the median error of imported poses: observations that are farther off do not count
-PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # what OPENCV has more parameters than
+SIMPLEST = CAMERA_MODELS[0]
 # Of the adjustment of all observations, before and after those that fit no more are dropped.
 FINAL_ITERATIONS = (3, 3)
 
 
 @dataclass(frozen=True)
 class AdjustedModel:
-    """The model after the final adjustment and what there is to say about it."""
+    """The model after the final bundle adjustment and what there is to say about it."""
 
     model: pycolmap.Reconstruction
     camera_models: list[dict[str, Any]]  # the comparison, a row per candidate (registration.json)
@@ -61,14 +58,14 @@ def final_bundle_adjustment(
         adjust = _adjust_thinned if thinned else _adjust
         adjust(model, database, seed, set(model.cameras), adjustment_options(False, choice.noise_px))
         return _finished(model, choice, {})
-    models = (camera_model,) if camera_model else MODELS
-    choice = choose(mapped, seed, models)
+    camera_models = (camera_model,) if camera_model else CAMERA_MODELS
+    choice = choose(mapped, seed, camera_models)
     model = _adjusted(mapped, database, seed, choice, thinned)
     if (
         not thinned
         and model.compute_num_observations() > MIN_GROWTH_TO_CHOOSE_AGAIN * mapped.compute_num_observations()
     ):
-        choice = choose(model, seed, models)
+        choice = choose(model, seed, camera_models)
         model = _adjusted(model, database, seed, choice, thinned)
     _simplify_degenerate(model, database, seed, choice)
     return _finished(model, choice, _deregister_degenerate(model, degenerate_cameras(model)))
@@ -163,90 +160,6 @@ def _adjust_thinned(
     mapper.filter_points(options.mapper)
     mapper.end_reconstruction(discard=False)
     model.update_point_3d_errors()
-
-
-def adjust_poses(sparse: Path, database: Path, images: Path, target: Path, error_px: float, limit_px: float) -> bool:
-    """Write to the folder ``target`` the model in ``sparse``, with the database's image ids, its poses adjusted to the
-    verified matches; ``error_px``: their median error at the given poses, ``limit_px``: that of an observation at most,
-    in the end. Cameras stay, and so does the frame: a similarity lays the new poses on the given ones. Photos without
-    observations keep theirs. False, and nothing is written, where the matches tell no points at these poses.
-    """
-    given, model = read_model(sparse), _at_unit_size(load_native(sparse))
-    for limit in (max(MAX_ERROR_MULTIPLE * error_px, limit_px), limit_px):
-        model = triangulated(model, database, images, limit, colours=False)
-        if not model.num_points3D():
-            return False
-        bundle_adjust(model, set(model.cameras), adjustment_options(False, noise_px(model, observations(model))))
-    adjusted = {
-        model.image(i).name: model.image(i).cam_from_world().inverse().matrix()
-        for i in model.reg_image_ids()
-        if model.image(i).num_points3D
-    }
-    before = {image.file: image.sfm_from_camera for image in given.images}
-    back = align_poses(np.array(list(adjusted.values())), np.array([before[name] for name in adjusted]))
-    poses = before | {name: back.pose(pose) for name, pose in adjusted.items()}
-    write_model(target, replace(given, images=[replace(i, sfm_from_camera=poses[i.file]) for i in given.images]))
-    return True
-
-
-def adjust_lenses(sparse: Path, database: Path, images: Path, target: Path, error_px: float, limit_px: float) -> bool:
-    """As :func:`adjust_poses`, but poses stay and cameras are adjusted, perspective ones with OPENCV's distortion."""
-    model = load_native(sparse)
-    for camera in model.cameras.values():
-        if camera.model_name in PERSPECTIVE:
-            params = dict(zip(camera.params_info.split(", "), camera.params, strict=True))
-            focal = [params.get(name, params.get("f")) for name in ("fx", "fy")]
-            radial = [params.get("k1", params.get("k", 0.0)), params.get("k2", 0.0)]
-            camera.model = pycolmap.CameraModelId.OPENCV
-            camera.params = [*focal, params["cx"], params["cy"], *radial, 0.0, 0.0]
-    limit = max(MAX_ERROR_MULTIPLE * error_px, limit_px)
-    model = triangulated(model, database, images, limit, colours=False)
-    if not model.num_points3D():
-        return False
-    adjustment = adjustment_options(True, noise_px(model, observations(model)))
-    bundle_adjust(model, set(), adjustment, constant_poses=True)
-    write_native(target, model)
-    return True
-
-
-def _at_unit_size(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """The model about its middle, so large that its cameras are a unit from there in the median: numbers of map
-    projections are too large to be adjusted."""
-    centres = np.array([model.image(i).projection_center() for i in model.reg_image_ids()])
-    middle = np.median(centres, axis=0)
-    size = float(np.median(np.linalg.norm(centres - middle, axis=1))) or 1.0
-    model.transform(pycolmap.Sim3d(1 / size, pycolmap.Rotation3d(np.eye(3)), -middle / size))
-    return model
-
-
-def release_focal_lengths(model: pycolmap.Reconstruction, constant_cameras: Collection[int] = ()) -> None:
-    """Adjust a model whose focal lengths were held while it was mapped, now with all of its images to tell them; those
-    of ``constant_cameras`` stay. Observations that do not fit are dropped."""
-    bundle_adjust(model, set(constant_cameras), adjustment_options(False, noise_px(model, observations(model))))
-    limits = pycolmap.IncrementalMapperOptions()
-    pycolmap.ObservationManager(model).filter_all_points3D(limits.filter_max_reproj_error, limits.filter_min_tri_angle)
-    model.update_point_3d_errors()
-
-
-def bundle_adjust(
-    model: pycolmap.Reconstruction,
-    constant_cameras: set[int],
-    adjustment: pycolmap.BundleAdjustmentOptions,
-    iterations: int = 100,
-    constant_poses: bool = False,
-) -> None:
-    """Adjust cameras, poses and points to the observations that the model has."""
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in sorted(model.reg_image_ids()):
-        config.add_image(image_id)
-        if constant_poses:
-            config.set_constant_rig_from_world_pose(model.image(image_id).frame_id)
-    for camera_id in constant_cameras:
-        config.set_constant_cam_intrinsics(camera_id)
-    if not constant_poses:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjustment.ceres.solver_options.max_num_iterations = iterations
-    pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
 
 
 def _adjust(

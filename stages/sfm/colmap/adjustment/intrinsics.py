@@ -12,7 +12,7 @@ from stages.ingest.exif import FOCAL_RANGE
 from stages.sfm.colmap.adjustment.observations import observations, points_in_camera
 from stages.sfm.colmap.cameras import is_fisheye, share_without_ray, why_no_ray
 
-MODELS = (
+CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
     "SIMPLE_RADIAL",
     "RADIAL",

@@ -1,4 +1,4 @@
-"""How well each photo's pose is known, in its own pixels. Call it in a child process."""
+"""How well each photo's pose is known, in its own pixels. Call it in a worker process."""
 
 import numpy as np
 import pycolmap

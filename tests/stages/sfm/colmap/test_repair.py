@@ -16,26 +16,28 @@ from PIL import Image
 from stages.io.photos import Photo
 from stages.sfm import global_mapping
 from stages.sfm.checked_mapping import Runs, _most_steps, _with_pieces_joined
-from stages.sfm.colmap.adjustment.final_bundle_adjustment import release_focal_lengths
+from stages.sfm.colmap.adjustment.bundle_adjustment import release_focal_lengths
 from stages.sfm.colmap.database.copies import copy_without_pairs
 from stages.sfm.colmap.database.images import adopt_cameras
 from stages.sfm.colmap.database.thinning import thin_matches
 from stages.sfm.colmap.diagnosis import compare_models
 from stages.sfm.colmap.mappers import incremental_options, map_incrementally
-from stages.sfm.colmap.repair import (
+from stages.sfm.colmap.model_check import (
     Candidate,
     agreeing_pairs,
     better,
     check_model,
+    facts,
+    reasons,
+    supported_runs,
+    supported_steps,
+)
+from stages.sfm.colmap.repair import (
     copy_consistent_matches,
     deregister,
     drop_outside_main_segment,
-    facts,
-    reasons,
     register_again,
     restricted,
-    supported_runs,
-    supported_steps,
 )
 from stages.sfm.matching import consecutive_pairs
 from stages.sfm.retry_strategies import MappingOptions

@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 
 from nerf.geometry.scene import Camera
-from stages.sfm.colmap.adjustment.camera_model_selection import adjustment_options
+from stages.sfm.colmap.adjustment.bundle_adjustment import adjustment_options
 from stages.sfm.colmap.adjustment.intrinsics import set_camera_models
 from stages.sfm.colmap.adjustment.observations import observations, points_in_camera, residuals
 from stages.sfm.colmap.cameras import native

@@ -8,7 +8,12 @@ import pytest
 from nerf.geometry.scene import Camera
 from stages.sfm.colmap.adjustment import final_bundle_adjustment, intrinsics
 from stages.sfm.colmap.adjustment.camera_model_selection import CameraModels, best_covered, choose, hold_out, paired
-from stages.sfm.colmap.adjustment.intrinsics import MODELS, CameraModelCandidate, set_camera_models, why_degenerate
+from stages.sfm.colmap.adjustment.intrinsics import (
+    CAMERA_MODELS,
+    CameraModelCandidate,
+    set_camera_models,
+    why_degenerate,
+)
 from stages.sfm.colmap.adjustment.observations import noise_px, observations, residuals
 from stages.sfm.colmap.cameras import native
 from tests.refusals import codes
@@ -57,7 +62,7 @@ def test_the_choice_repeats_and_says_why() -> None:
     assert choose(model, seed=3) == choice
     assert choose(model, seed=4).table != choice.table
     assert [(row["model"], row["principal_point"]) for row in choice.table] == [
-        (name, place) for name in MODELS for place in ("fixed", "refined")
+        (name, place) for name in CAMERA_MODELS for place in ("fixed", "refined")
     ]
     best = min(choice.table, key=lambda row: row["held_out_px"] or 9)
     assert (best["worse_px"], best["noise_px"]) == (0, 0)
@@ -187,7 +192,7 @@ def test_noise_of_differences_is_that_of_independent_cells() -> None:
     assert again == (pytest.approx(mean), pytest.approx(error))
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", CAMERA_MODELS)
 def test_a_camera_of_another_model_draws_the_same(name: str) -> None:
     model = photographed(lens("SIMPLE_RADIAL", 900, *CENTRE, -0.05), noise=0, points=200, photos=4)
     before = model.camera(1).mean_focal_length()
@@ -221,7 +226,7 @@ def test_degenerate_cameras_are_out(camera: Camera, why: str | None) -> None:
 
 
 def test_fisheye_counts_as_less_simple_than_any_other() -> None:
-    lenses = [CameraModelCandidate(name, refined) for name in MODELS for refined in (False, True)]
+    lenses = [CameraModelCandidate(name, refined) for name in CAMERA_MODELS for refined in (False, True)]
     ordered = sorted(lenses, key=lambda one: one.complexity)
     assert [one.free_parameters for one in ordered] == [1, 2, 3, 3, 4, 5, 6, 8, 2, 3, 4, 5, 6, 8]
     assert [one.model.endswith("FISHEYE") for one in ordered] == 8 * [False] + 6 * [True]
