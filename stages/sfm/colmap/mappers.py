@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from stages.sfm.colmap.adjustment.observations import shared_points
 from stages.sfm.retry_strategies import MIN_POSE_INLIERS, MappingOptions
 
 MIN_MODEL_IMAGES = 3
@@ -98,18 +98,14 @@ def map_globally(
 
 
 def _keep_largest_group(model: pycolmap.Reconstruction) -> None:
-    images = [model.image(image_id) for image_id in sorted(model.reg_image_ids())]
+    """Deregister images that share no points with the largest group of those that do."""
     if not model.num_points3D():
         return
-    points = [[point2D.point3D_id for point2D in image.get_observation_points2D()] for image in images]
-    owner = np.repeat(np.arange(len(images)), [len(seen) for seen in points])
-    point = np.unique(np.array([one for seen in points for one in seen], np.int64), return_inverse=True)[1]
-    sees = csr_matrix((np.ones(len(owner)), (owner, point)), shape=(len(images), int(point.max()) + 1))
-    _, group = connected_components((sees @ sees.T) >= MIN_POSE_INLIERS, directed=False)
+    _, group = connected_components(shared_points(model) >= MIN_POSE_INLIERS, directed=False)
     largest = np.bincount(group).argmax()
-    for image, of in zip(images, group, strict=True):
+    for image_id, of in zip(sorted(model.reg_image_ids()), group, strict=True):
         if of != largest:
-            model.deregister_frame(image.frame_id)
+            model.deregister_frame(model.image(image_id).frame_id)
 
 
 def _rank(model: pycolmap.Reconstruction) -> tuple[int, int]:

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import pycolmap
 from jaxtyping import Float, Int
-from scipy.sparse import csr_matrix
 
 from stages.contract import Note
 from stages.sfm.colmap.adjustment.bundle_adjustment import adjustment_options, bundle_adjust
@@ -24,7 +23,7 @@ from stages.sfm.colmap.adjustment.intrinsics import (
     degenerate_cameras,
     set_camera_models,
 )
-from stages.sfm.colmap.adjustment.observations import Observations, noise_px, observations, residuals
+from stages.sfm.colmap.adjustment.observations import Observations, noise_px, observations, residuals, shared_points
 from stages.sfm.pairs.match_graph import most_linked
 
 # Points for the comparison are drawn until they have so many observations: 14 candidates then take seconds.
@@ -150,15 +149,7 @@ def best_covered(model: pycolmap.Reconstruction, count: int) -> set[int]:
     """So many images (ids) that hang together by the most shared points: the one that shares most, then again and again
     the one that shares most with those taken."""
     ids = sorted(model.reg_image_ids())
-    number = {image_id: index for index, image_id in enumerate(ids)}
-    seen = [
-        (number[element.image_id], index)
-        for index, point_id in enumerate(sorted(model.point3D_ids()))
-        for element in model.point3D(point_id).track.elements
-    ]
-    image, point = np.array(seen, np.int64).reshape(-1, 2).T
-    sees = csr_matrix((np.ones(len(image)), (image, point)), (len(ids), model.num_points3D()))
-    shared: Float[np.ndarray, "images images"] = (sees @ sees.T).toarray()
+    shared: Float[np.ndarray, "images images"] = shared_points(model).toarray()
     np.fill_diagonal(shared, 0)
     return {ids[photo] for photo, _ in islice(most_linked(shared), count)}
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 from jaxtyping import Float, Int
+from scipy.sparse import csr_matrix
 
 MEDIAN_PER_SIGMA = 1.1774  # the median length of a 2-D Gaussian vector over the deviation of its coordinates: √(2 ln 2)
 MIN_NOISE_PX = 0.01  # no detector places a feature better than this
@@ -32,6 +33,15 @@ def observations(model: pycolmap.Reconstruction) -> Observations:
         np.array([p.point3D_id for s in seen for p in s], np.int64),
         np.array([p.xy for s in seen for p in s], float).reshape(-1, 2),
     )
+
+
+def shared_points(model: pycolmap.Reconstruction) -> csr_matrix:
+    """How many points any two registered images, in order of their ids, both see."""
+    ids, seen = sorted(model.reg_image_ids()), observations(model)
+    points, point = np.unique(seen.point, return_inverse=True)
+    where = np.searchsorted(ids, seen.image), point
+    sees = csr_matrix((np.ones(len(point)), where), shape=(len(ids), len(points)))
+    return sees @ sees.T
 
 
 def points_in_camera(

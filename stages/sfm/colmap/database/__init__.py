@@ -6,4 +6,6 @@ and kept in memory; what they tell of how similar photos are. ``matching``: pair
 
 ``files``: the database as a file that others read along and that is copied whole. ``copies``: copies with fewer matches
 or other cameras. ``thinning``: the copy with the longest tracks, on which many photos are mapped.
+
+Where functions speak of photos these are numbered from 0, as everywhere in stage sfm; an image id is 1 more.
 """

@@ -21,12 +21,15 @@ MIN_CACHED_PHOTOS, CACHE_SHARE = 256, 0.25
 
 
 class PhotoFeatures(NamedTuple):
+    """What matching and verification need of a photo."""
+
     camera: pycolmap.Camera
     keypoints: np.ndarray  # (keypoints, 2), pixels
     features: Any  # descriptors, (keypoints, 128) bytes, or IndexedFeatures of them
 
 
 SharedFeatures = Callable[[], PhotoFeatures]
+"""As they reach whoever matches, on this machine or another one."""
 
 
 class Features:

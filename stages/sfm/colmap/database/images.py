@@ -13,14 +13,11 @@ from stages.io.photos import Photo
 
 FOCAL_GUESS = 1.2  # focal length over the longer side where EXIF is silent: 45 degrees, a phone's main camera
 MAPPING_MODEL = "SIMPLE_RADIAL"  # one focal length and one distortion term hold with few matches
-FISHEYE_ANGLE_DEG = 150.0
-
+FISHEYE_ANGLE_DEG = 150.0  # from corner to corner where EXIF is silent
 
 Turns = Mapping[str, int]
 """By image name the quarter turns clockwise that made a photo upright, of photos whose features are kept where their
 sensor had them; all others are absent."""
-
-
 NO_TURNS: Turns = MappingProxyType({})
 
 
@@ -95,7 +92,7 @@ def _first_guess(
 
 
 def fisheye_focal_px(width: int, height: int) -> float:
-    """Of an equidistant camera, r = f θ, with FISHEYE_ANGLE_DEG from corner to corner."""
+    """Guess of an equidistant camera, r = f θ, with FISHEYE_ANGLE_DEG from corner to corner."""
     return math.hypot(width, height) / math.radians(FISHEYE_ANGLE_DEG)
 
 

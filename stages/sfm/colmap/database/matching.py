@@ -1,4 +1,4 @@
-"""Matching and verification of pairs of photos, and which pairs were matched so far."""
+"""Matching and verification of pairs of photos, and what is matched so far."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -27,8 +27,6 @@ BLOCK_SIZE = 32  # pairs of photos that are worked on and committed at once (pro
 
 
 Item = TypeVar("Item")
-
-
 Result = TypeVar("Result")
 
 
@@ -38,7 +36,7 @@ def match_pairs(
     seed: int,
     max_ratio: float,
     on_expected: Callable[[int, float], None] = lambda left, seconds: None,
-    features: "Features | None" = None,
+    features: Features | None = None,
 ) -> None:
     """Match and verify these pairs of photos (numbered from 0) where that has not been done yet.
 
