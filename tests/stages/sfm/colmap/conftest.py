@@ -6,6 +6,7 @@ import pytest
 
 from stages.io.photos import Photo
 from stages.sfm.colmap.database.images import fill_database
+from tests.stages.sfm.colmap.made_models import Made, make
 from tests.stages.sfm.pairs.test_feature_matching import random_descriptors
 
 COUNT = 6
@@ -31,3 +32,9 @@ def database(tmp_path: Path) -> Path:
             kind = pycolmap.FeatureExtractorType.SIFT
             db.write_descriptors(photo + 1, pycolmap.FeatureDescriptors(data=noisy[inside], type=kind))
     return path
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Made:
+    """A model with the true poses, and its matches."""
+    return make(tmp_path)

@@ -7,6 +7,8 @@ from stages.io.photos import Photo
 from stages.sfm.colmap.database import calibration
 from stages.sfm.colmap.database.calibration import calibrate_focal_lengths
 from stages.sfm.colmap.database.images import MAPPING_MODEL, fill_database
+from stages.sfm.colmap.database.thinning import thin_matches
+from tests.stages.sfm.colmap.made_models import FOCAL_PX, enter_focal_length, focal_length, look_apart, make
 
 
 def test_told_focal_lengths_do_not_depend_on_timing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -21,3 +23,32 @@ def test_told_focal_lengths_do_not_depend_on_timing(tmp_path: Path, monkeypatch:
         with pycolmap.Database.open(database) as db:
             told.append(db.read_camera(1).mean_focal_length())
     assert told == [1234.57, 1234.57]
+
+
+@pytest.mark.parametrize("ratio", [0.5, 0.9, 1.2, 2.0])
+@pytest.mark.parametrize("by_exif", [True, False])
+def test_focal_lengths_are_calibrated_where_exif_is_far_off(tmp_path: Path, ratio: float, by_exif: bool) -> None:
+    made = make(tmp_path)
+    look_apart(made)
+    enter_focal_length(made.database, ratio * FOCAL_PX, by_exif=by_exif)
+    assert thin_matches(made.database, tmp_path / "thinned.db") and not list(tmp_path.glob("*calibration*"))
+    found = focal_length(tmp_path / "thinned.db") / FOCAL_PX
+    assert found == ratio if by_exif and 0.8 < ratio < 1.3 else abs(found - 1) < 0.1
+
+
+@pytest.mark.parametrize("by_exif", [True, False])
+def test_photos_whose_axes_meet_calibrate_nothing(tmp_path: Path, by_exif: bool) -> None:
+    made = make(tmp_path)
+    enter_focal_length(made.database, 0.5 * FOCAL_PX, by_exif=by_exif)
+    assert not thin_matches(made.database, tmp_path / "thinned.db")
+    assert focal_length(tmp_path / "thinned.db") == 0.5 * FOCAL_PX
+
+
+def test_known_cameras_and_fisheyes_are_not_calibrated(tmp_path: Path) -> None:
+    made = make(tmp_path)
+    look_apart(made)
+    enter_focal_length(made.database, 0.5 * FOCAL_PX, by_exif=True)
+    assert not thin_matches(made.database, tmp_path / "known.db", camera_is_known=True)
+    enter_focal_length(made.database, 0.5 * FOCAL_PX, by_exif=True, model="OPENCV_FISHEYE")
+    assert not thin_matches(made.database, tmp_path / "fisheye.db")
+    assert focal_length(tmp_path / "known.db") == focal_length(tmp_path / "fisheye.db") == 0.5 * FOCAL_PX

@@ -1,11 +1,17 @@
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pycolmap
 
 from stages.sfm.colmap.database.files import keep_open
+from stages.sfm.colmap.database.thinning import thin_matches
 from tests.stages.sfm.colmap.conftest import COUNT
+from tests.stages.sfm.colmap.made_models import (
+    Made,
+)
 
 READER = """
 import sys
@@ -31,3 +37,18 @@ def test_an_open_database_can_be_read_along(database: Path) -> None:
     finally:
         reader.kill()
         reader.wait()
+
+
+def test_a_killed_copys_log_is_not_reused(made: Made, tmp_path: Path) -> None:
+    copy, log = tmp_path / "thinned.db", tmp_path / "thinned.db-wal"
+    thin_matches(made.database, copy)
+    with closing(sqlite3.connect(copy)) as killed:
+        killed.execute("pragma journal_mode=wal")
+        killed.execute("create table left_behind as select * from matches")
+        killed.commit()
+        left = log.read_bytes()
+    log.write_bytes(left)
+    thin_matches(made.database, copy)
+    with closing(sqlite3.connect(copy)) as database:
+        assert database.execute("pragma integrity_check").fetchall() == [("ok",)]
+        assert not database.execute("select name from sqlite_master where name = 'left_behind'").fetchall()

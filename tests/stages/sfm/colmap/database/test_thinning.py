@@ -1,11 +1,20 @@
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
+import pycolmap
 
 from stages.sfm.colmap.database.correspondences import Correspondences
-from stages.sfm.colmap.database.thinning import best_tracks
+from stages.sfm.colmap.database.thinning import best_tracks, thin_matches
+from stages.sfm.colmap.diagnosis import compare_models
+from stages.sfm.colmap.mappers import incremental_options, map_incrementally
+from stages.sfm.colmap.model_check import (
+    check_model,
+)
+from stages.sfm.retry_strategies import MappingOptions
+from tests.stages.sfm.colmap.made_models import PHOTOS, make
 
-PHOTOS, KEYPOINTS = 4, 6
+TRACKED_PHOTOS, KEYPOINTS = 4, 6
 
 
 def matched(*tracks: list[tuple[int, int]]) -> Correspondences:
@@ -13,7 +22,7 @@ def matched(*tracks: list[tuple[int, int]]) -> Correspondences:
     rows = [(first, second) for track in tracks for first, second in pairwise(track)]
     numbers = np.array([[photo * KEYPOINTS + keypoint for photo, keypoint in row] for row in rows]).reshape(-1, 2)
     pair = np.zeros(len(rows), int)
-    return Correspondences(np.array([[1, 2]]), pair, numbers, KEYPOINTS * np.arange(PHOTOS + 1))
+    return Correspondences(np.array([[1, 2]]), pair, numbers, KEYPOINTS * np.arange(TRACKED_PHOTOS + 1))
 
 
 def kept(correspondences: Correspondences, cells: np.ndarray, tracks: int) -> set[tuple[int, int]]:
@@ -21,7 +30,7 @@ def kept(correspondences: Correspondences, cells: np.ndarray, tracks: int) -> se
     return {(int(k) // KEYPOINTS, int(k) % KEYPOINTS) for k in chosen}
 
 
-ONE_CELL = np.zeros(PHOTOS * KEYPOINTS, int)
+ONE_CELL = np.zeros(TRACKED_PHOTOS * KEYPOINTS, int)
 LONG = [(0, 0), (1, 0), (2, 0), (3, 0)]
 SHORT = [(0, 1), (1, 1)]
 MIDDLE = [(0, 2), (1, 2), (2, 2)]
@@ -54,3 +63,17 @@ def test_a_track_that_sees_a_photo_twice_comes_last() -> None:
 
 def test_nothing_matched_keeps_nothing() -> None:
     assert kept(matched(), ONE_CELL, 5) == set()
+
+
+def test_mapping_of_thinned_matches_finds_the_same_cameras(tmp_path: Path) -> None:
+    made = make(tmp_path, points=1000)
+    thinned = tmp_path / "thinned.db"
+    thin_matches(made.database, thinned, tracks=30)
+    with pycolmap.Database.open(made.database) as db, pycolmap.Database.open(thinned) as few:
+        before, after = db.num_inlier_matches(), few.num_inlier_matches()
+    assert 0 < after < 0.6 * before
+    options = incremental_options(0, MappingOptions(), camera_is_known=False, thinned=True)
+    (model,) = map_incrementally(thinned, tmp_path, tmp_path / "models", options)
+    compared = compare_models(made.model, model)
+    assert compared["agree"] == PHOTOS and 0 < compared["centre"] < 0.01
+    assert check_model(model, made.database, 0).check.passed.all()
