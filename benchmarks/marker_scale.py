@@ -23,7 +23,8 @@ from benchmarks.record import Record, add_out
 from nerf.geometry.alignment import align
 from nerf.geometry.rays import Rays, rays_of_view
 from nerf.geometry.scene import Camera
-from nerf.rendering.srgb import srgb_to_linear, srgb_values
+from nerf.rendering.srgb import srgb_to_linear
+from nerf.rendering.srgb_arrays import srgb_values
 from nerf.synthetic.scenes import Solid, SyntheticScene, ring_of_cameras, still_life
 from nerf.synthetic.shapes import Box
 from pipeline.cli.commands import run_command

@@ -38,7 +38,7 @@ from benchmarks.mesh_looks import looks, scores, truth_of, write_strip
 from benchmarks.record import Record, add_out
 from nerf.geometry.alignment import MAX_DEVIATION, align
 from nerf.geometry.scene import Similarity
-from nerf.rendering.srgb import linear_light, srgb_values
+from nerf.rendering.srgb_arrays import linear_light, srgb_values
 from pipeline.engine.workspace import Workspace
 from stages import mesh
 from stages.contract import SilentProgress

@@ -22,7 +22,8 @@ from torch import Tensor
 
 from nerf.effects import HeldOutImages, Images
 from nerf.geometry.rays import Rays
-from nerf.rendering.srgb import LINEAR_THRESHOLD, OFFSET, POWER, SLOPE, linear_to_srgb, srgb_to_linear
+from nerf.rendering.srgb import linear_to_srgb, srgb_to_linear
+from nerf.rendering.srgb_arrays import LINEAR_THRESHOLD, OFFSET, POWER, SLOPE
 
 LEARNING_RATE = 2e-3  # of the logarithm of a gain; gains begin within a percent or two of where they end
 MAX_LOG_GAIN = 16.0  # either way: 23 stops, beyond what any camera spans

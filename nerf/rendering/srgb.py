@@ -1,12 +1,11 @@
-"""The transfer curve of sRGB (IEC 61966-2-1): linear up to a threshold, a power law above it."""
+"""The transfer curve of sRGB on tensors, bounded, with gradients; srgb_arrays.py has it on arrays."""
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-SLOPE, OFFSET, POWER = 12.92, 0.055, 2.4
-LINEAR_THRESHOLD = 0.04045  # of sRGB; in linear light LINEAR_THRESHOLD / SLOPE
+from nerf.rendering.srgb_arrays import LINEAR_THRESHOLD, OFFSET, POWER, SLOPE
+
 MAX_SRGB = 1e12  # its linear light is 5e28; that of much brighter colours overflows float32
 
 
@@ -24,15 +23,3 @@ def linear_to_srgb(l: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:  # noqa: E741
         1 / POWER
     ) - OFFSET  # no power of 0: its slope is infinite
     return torch.where(light > LINEAR_THRESHOLD / SLOPE, power, light * SLOPE)
-
-
-def linear_light(colour: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """As :func:`srgb_to_linear`, of arrays and without bounds. Inverse: :func:`srgb_values`."""
-    power = ((np.maximum(colour, LINEAR_THRESHOLD) + OFFSET) / (1 + OFFSET)) ** POWER
-    return np.where(colour <= LINEAR_THRESHOLD, colour / SLOPE, power)
-
-
-def srgb_values(light: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """As :func:`linear_to_srgb`, of arrays and without bounds; NaN stays. Inverse: :func:`linear_light`."""
-    power = (1 + OFFSET) * np.maximum(light, LINEAR_THRESHOLD / SLOPE) ** (1 / POWER) - OFFSET
-    return np.where(light <= LINEAR_THRESHOLD / SLOPE, SLOPE * light, power)

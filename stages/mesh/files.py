@@ -29,7 +29,7 @@ from trimesh.exchange.stl import export_stl
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from nerf.rendering.srgb import linear_light
+from nerf.rendering.srgb_arrays import linear_light
 from stages.mesh.texture.atlas import Texture
 
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])

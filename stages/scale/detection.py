@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from nerf.geometry.scene import Camera
-from nerf.rendering.srgb import linear_light
+from nerf.rendering.srgb_arrays import linear_light
 from stages.scale.marker_names import DICTIONARIES, printed_name
 from stages.sfm.colmap.cameras import ray_directions
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from nerf.effects.statistics.exposure import ExposureFit
 from nerf.effects.statistics.statistic import MIN_SIGNAL_TO_NOISE, OF_GAUSSIAN
 from nerf.effects.statistics.tracks import TrackColours
-from nerf.rendering.srgb import linear_light, srgb_values
+from nerf.rendering.srgb_arrays import linear_light, srgb_values
 
 OUTLIER = 0.1  # sRGB value, rms of the channels: ten times what a good photo is off by
 MIN_POINTS = 20  # in a photo, for a share of them to mean something

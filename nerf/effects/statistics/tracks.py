@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from nerf.rendering.srgb import LINEAR_THRESHOLD, OFFSET, POWER, linear_light
+from nerf.rendering.srgb_arrays import LINEAR_THRESHOLD, OFFSET, POWER, linear_light
 
 MAX_IN_TRACK = 64  # observations of one point that enter a fit: their number of pairs is what a fit costs
 

@@ -14,7 +14,7 @@ from nerf.effects.statistics.additive_model import AdditiveModel
 from nerf.effects.statistics.exposure import ExposureFit
 from nerf.effects.statistics.statistic import MIN_EFFECT, Statistic, classify, unknown
 from nerf.effects.statistics.tracks import TrackColours, log_light
-from nerf.rendering.srgb import OFFSET, POWER
+from nerf.rendering.srgb_arrays import OFFSET, POWER
 
 THRESHOLD = 2 * MIN_EFFECT  # deviation of colours, sRGB values: a field of diffuse colours has it as its error
 MIN_PAIRS = 60  # in each of the two ranges of angles

@@ -10,7 +10,7 @@ from nerf.effects.statistics.outlier_images import OutlierImages
 from nerf.effects.statistics.poses import PX, THRESHOLD_PX
 from nerf.effects.statistics.statistic import OF_GAUSSIAN, Statistic, classify, unknown
 from nerf.effects.statistics.tracks import MAX_IN_TRACK, TrackColours, within_groups
-from nerf.rendering.srgb import linear_light
+from nerf.rendering.srgb_arrays import linear_light
 
 # Light through a medium is J exp(-b d) + A (1 - exp(-b d)) (Koschmieder 1924) with A nearly grey: the difference of the
 # largest and the least channel falls as exp(-b d). Over their mean it does too, for colours about as bright as A, and

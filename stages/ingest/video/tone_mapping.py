@@ -8,6 +8,7 @@ from pathlib import Path
 import imageio_ffmpeg
 import numpy as np
 
+from nerf.rendering.srgb_arrays import srgb_values
 from stages.contract import Progress
 from stages.io.ascii_names import shell_quoted
 
@@ -75,7 +76,7 @@ def tone_mapped(pixels: np.ndarray, transfer: str, primaries: int) -> np.ndarray
             light *= (MAX_NITS / WHITE_NITS) * (light @ BT2020_LUMINANCE)[..., None] ** 0.2
         if primaries == BT2020:
             light = np.maximum(light @ BT709_FROM_BT2020.T, 0)
-        srgb[top : top + _ROWS] = np.rint(255 * _srgb(_rolled_off(light)))
+        srgb[top : top + _ROWS] = np.rint(255 * srgb_values(_rolled_off(light)))
     return srgb
 
 
@@ -97,11 +98,6 @@ def _rolled_off(light: np.ndarray) -> np.ndarray:
     b = (start**2 - 2 * start * peak + peak) / (peak - 1)
     brightest = np.maximum(light.max(axis=-1, keepdims=True), start)
     return np.minimum(light * ((b + start) ** 2 / (b - a) * (brightest + a) / (brightest + b) / brightest), 1)
-
-
-def _srgb(light: np.ndarray) -> np.ndarray:
-    """As nerf/rendering/srgb.py has it, which imports torch."""
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
 def gamut_mapping(primaries: str) -> str:

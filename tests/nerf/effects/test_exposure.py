@@ -13,7 +13,8 @@ from nerf.effects.appearance import AppearanceModel
 from nerf.effects.exposure import ExposureModel, expose, expose_backward, fit_log_gain
 from nerf.fields.interface import RadianceModel, Rendering
 from nerf.geometry.rays import Rays
-from nerf.rendering.srgb import LINEAR_THRESHOLD, linear_to_srgb, srgb_to_linear
+from nerf.rendering.srgb import linear_to_srgb, srgb_to_linear
+from nerf.rendering.srgb_arrays import LINEAR_THRESHOLD
 
 EXTREMES = [0.0, 1e-30, 1e-8, 0.04, LINEAR_THRESHOLD, 0.0405, 0.5, 1.0, 2.0, 1e4, 1e12, 1e20, 1e30]
 gains = st.floats(-3, 3)

@@ -6,7 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.rendering.srgb import LINEAR_THRESHOLD, linear_light, linear_to_srgb, srgb_to_linear, srgb_values
+from nerf.rendering.srgb import linear_to_srgb, srgb_to_linear
+from nerf.rendering.srgb_arrays import LINEAR_THRESHOLD, linear_light, srgb_values
 from tests.nerf.effects.statistics.photographed_points import encoded
 
 EXTREMES = [0.0, 1e-30, 1e-8, 0.04, LINEAR_THRESHOLD, 0.0405, 0.5, 1.0, 2.0, 1e4, 1e12, 1e20, 1e30]

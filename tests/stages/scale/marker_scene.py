@@ -9,7 +9,7 @@ import numpy as np
 
 from nerf.geometry.camera_paths import look_at
 from nerf.geometry.scene import Camera, Scene, Similarity, View
-from nerf.rendering.srgb import srgb_values
+from nerf.rendering.srgb_arrays import srgb_values
 from stages.sfm.colmap.cameras import camera_rays
 
 CAMERA = Camera("SIMPLE_RADIAL", 480, 360, (430.0, 238.0, 182.0, -0.05))

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from nerf.effects.appearance import AppearanceModel
-from nerf.rendering.srgb import linear_light, srgb_values
+from nerf.rendering.srgb_arrays import linear_light, srgb_values
 from stages import train, viewer
 from stages.contract import run_stage
 from stages.effects.image_effects import photo_effects

@@ -9,7 +9,7 @@ from nerf.effects.statistics import outlier_images, view_dependence, vignetting,
 from nerf.effects.statistics.exposure import EV, fit_exposure
 from nerf.effects.statistics.statistic import Statistic
 from nerf.effects.statistics.tracks import TrackColours
-from nerf.rendering.srgb import linear_light
+from nerf.rendering.srgb_arrays import linear_light
 from tests.nerf.effects.statistics.photographed_points import encoded, photographed_points
 
 SEEDS = range(20)
