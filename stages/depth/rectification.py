@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from nerf.geometry.scene import Camera
-from stages.sfm.colmap.cameras import focal_and_centre, project, ray_directions
+from stages.sfm.colmap.cameras import mean_focal_and_centre, project, ray_directions
 
 MAX_TILT_DEG = 50.0  # between a photo's optical axis and the rectified one; beyond, pixels are stretched threefold
 MAX_HALF_ANGLE_DEG = 60.0  # of the rectified field of view: a wider fisheye keeps its middle
@@ -50,7 +50,7 @@ class Viewpoint(NamedTuple):
     @property
     def focal_px(self) -> float:
         """Mean focal length at the size of the depth map."""
-        return focal_and_centre(self.camera)[0] * self.size[0] / self.camera.width
+        return mean_focal_and_centre(self.camera)[0] * self.size[0] / self.camera.width
 
 
 class Pixels(NamedTuple):

@@ -20,7 +20,7 @@ from nerf.geometry.scene import Scene, View
 from stages.contract import Progress
 from stages.hardware.device import processors
 from stages.io.pixels import load_mask, load_pixels
-from stages.sfm.colmap.cameras import focal_and_centre, project
+from stages.sfm.colmap.cameras import mean_focal_and_centre, project
 
 MAX_OBSERVATIONS = 200_000  # observations: gains of 500 photos are then known to a few thousandths
 MAX_EXPECTED = 1000  # places per photo where a point should be seen and was not matched
@@ -101,7 +101,7 @@ def _seen_from(scene: Scene, xyz: np.ndarray, view: np.ndarray, point: np.ndarra
     views = scene.of_split("train")
     if not len(view):
         return replace(TrackColours.empty(len(views)), texture=np.zeros(0))
-    intrinsics = [focal_and_centre(camera) for camera in scene.cameras]
+    intrinsics = [mean_focal_and_centre(camera) for camera in scene.cameras]
     focal = np.array([intrinsics[one.camera][0] for one in views])[view]
     middle = np.array([intrinsics[one.camera][1] for one in views])[view]
     diagonal = np.array([np.hypot(*_size(scene, one)) for one in views])[view]

@@ -15,7 +15,7 @@ from stages.scale.detection import cells_of, find_markers, locate_corners, lumin
 from stages.scale.marker_names import Marker, parse_marker
 from stages.scale.references import MAX_STANDARD_ERRORS, Reference
 from stages.scale.square_fit import Sightings, Square, fit_square
-from stages.sfm.colmap.cameras import focal_and_centre
+from stages.sfm.colmap.cameras import mean_focal_and_centre
 
 if TYPE_CHECKING:
     from stages.scale import Config
@@ -140,7 +140,7 @@ def _sightings(seen: Sequence[_Sighting], scene: Scene) -> Sightings:
     rotations = np.stack([view.scene_from_camera[:, :3].T for view in views])
     centres = np.stack([view.scene_from_camera[:, 3] for view in views])
     translations = -(rotations @ centres[..., None])
-    focal = np.array([focal_and_centre(scene.cameras[view.camera])[0] for view in views])
+    focal = np.array([mean_focal_and_centre(scene.cameras[view.camera])[0] for view in views])
     return Sightings(np.concatenate([rotations, translations], axis=2), np.stack([s.corners for s in seen]), focal)
 
 

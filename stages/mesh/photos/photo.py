@@ -19,7 +19,7 @@ from stages.contract import StageError
 from stages.effects.image_effects import new_view_effects, photo_effects
 from stages.io.photos import read_photos
 from stages.io.pixels import OPAQUE_FROM, load_mask, load_pixels
-from stages.sfm.colmap.cameras import border_rays, focal_and_centre, project
+from stages.sfm.colmap.cameras import border_rays, mean_focal_and_centre, project
 
 REMAP_SIDE = 1 << 14  # points that OpenCV takes in a row
 
@@ -74,7 +74,7 @@ def photo_of(view: View, scene: Scene, ingest: Path, field: dict[str, Any]) -> P
 
 @lru_cache
 def _optics(camera: Camera) -> tuple[float, float]:
-    return focal_and_centre(camera)[0], float(border_rays(camera)[:, 2].min())
+    return mean_focal_and_centre(camera)[0], float(border_rays(camera)[:, 2].min())
 
 
 @lru_cache(maxsize=1)

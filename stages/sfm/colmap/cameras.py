@@ -155,6 +155,12 @@ def focal_lengths_and_centre(camera: Camera) -> tuple[list[float], list[float]]:
     return [camera.params[i] for i in focal], [camera.params[i] for i in centre]
 
 
+def mean_focal_and_centre(camera: Camera) -> tuple[float, tuple[float, float]]:
+    """The mean focal length and the principal point, in pixels."""
+    model = native(camera)
+    return float(model.mean_focal_length()), (float(model.principal_point_x), float(model.principal_point_y))
+
+
 def native(camera: Camera, camera_id: int = 1) -> pycolmap.Camera:
     """The same camera for COLMAP. Raises ValueError where the model takes another number of parameters."""
     model = pycolmap.Camera(
@@ -172,9 +178,3 @@ def native(camera: Camera, camera_id: int = 1) -> pycolmap.Camera:
 def plain(camera: pycolmap.Camera) -> Camera:
     """The inverse of :func:`native`."""
     return Camera(camera.model_name, camera.width, camera.height, tuple(float(p) for p in camera.params))
-
-
-def focal_and_centre(camera: Camera) -> tuple[float, tuple[float, float]]:
-    """The mean focal length and the principal point, in pixels."""
-    model = native(camera)
-    return float(model.mean_focal_length()), (float(model.principal_point_x), float(model.principal_point_y))

@@ -1,4 +1,4 @@
-"""Why an image is unregistered. Call it in a worker process."""
+"""Why an image is unregistered, and in which images models differ. Call it in a worker process."""
 
 from collections import Counter
 from collections.abc import Container, Sequence

@@ -1,6 +1,6 @@
 """Images whose poses contradict their matches: deregistered, registered again, left out if that does not help.
 
-Call it in a worker process. model_check.py finds them.
+Call it in a worker process. model_check.py says which they are.
 """
 
 import shutil

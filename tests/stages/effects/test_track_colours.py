@@ -25,7 +25,7 @@ from stages.effects.track_colours import (
 )
 from stages.io.files import write_png
 from stages.io.photos import Photo, write_photos
-from stages.sfm.colmap.cameras import focal_and_centre
+from stages.sfm.colmap.cameras import mean_focal_and_centre
 from tests.conftest import RecordedProgress
 from tests.stages.photo_scene import pose_towards_origin
 
@@ -290,4 +290,4 @@ def test_no_evidence_without_points(tmp_path: Path, progress: RecordedProgress) 
 
 def test_focal_length_and_principal_point() -> None:
     camera = Camera("OPENCV", 100, 80, (50.0, 52.0, 49.0, 41.0, 0.1, 0.0, 0.0, 0.0))
-    assert focal_and_centre(camera) == (51.0, (49.0, 41.0))
+    assert mean_focal_and_centre(camera) == (51.0, (49.0, 41.0))
