@@ -82,7 +82,7 @@ def decide(folder: Path, made: Effects, seed: int) -> Outcome:
     """Make the photos and run the stage on them."""
     inputs, out = effect_scene(folder / "scene", made, seed), folder / "effects"
     out.mkdir()
-    run_stage(effects, effects.Config(seed=seed), inputs, out, SilentProgress())
+    run_stage(effects.STAGE, effects.Config(seed=seed), inputs, out, SilentProgress())
     return Outcome(read_decisions(out), json.loads((out / "effects.json").read_text("utf-8")), inputs, made)
 
 

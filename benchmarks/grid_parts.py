@@ -86,7 +86,7 @@ def prepared(workspace: Path, asked: Config) -> tuple[Config, FieldTrainer]:
 def loaded(workspace: Path, asked: Config) -> tuple[Config, Scene, RayDataset, Decisions]:
     """What a fresh field is made of: the settings that stage train chose, which are printed, and its inputs."""
     inputs = {stage: stage_folder(workspace, output) for stage, output in LINKED.items()}
-    scene, config = read_scene(inputs["normalise"]), plan_stage(train, asked, inputs, PlainDisplay())
+    scene, config = read_scene(inputs["normalise"]), plan_stage(train.STAGE, asked, inputs, PlainDisplay())
     assert config.downscale, "plan() chooses it"
     grid = config.grid
     sizes = f"{grid.num_levels} grids of 2^{grid.log2_hashmap_size} rows to {grid.max_res}³"

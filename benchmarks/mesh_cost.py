@@ -24,7 +24,7 @@ from nerf import REGION_HALF_SIZE
 from pipeline.demo.truth import Truth, compare_with_truth
 from pipeline.engine.workspace import Workspace
 from stages.contract import Inputs, SilentProgress
-from stages.mesh import INPUTS, Config
+from stages.mesh import STAGE, Config
 from stages.mesh.extraction import Source, extract_mesh, load, write_mesh
 from stages.mesh.files import ColouredMesh
 from stages.mesh.surface import sample_surface
@@ -74,7 +74,7 @@ def main() -> None:
     given = parser.parse_args()
     workspace = Workspace.existing(given.workspace)
     keys = workspace.read_run().keys
-    folders = {stage: workspace.folder(stage, keys[stage]) for stage in INPUTS}
+    folders = {stage: workspace.folder(stage, keys[stage]) for stage in STAGE.inputs}
     truth = Truth.read(given.truth) if given.truth else None
     record = Record(given.out)
     for resolution in given.resolutions:

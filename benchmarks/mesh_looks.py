@@ -126,7 +126,7 @@ def meshes_of(source: Source, inputs: Inputs, resolution: int) -> dict[str, tupl
     made = []
     for size in (Config().texture_size, 0):
         asked = Config(resolution=resolution, texture_size=size)
-        config = plan_stage(mesh, asked, inputs, SilentProgress())
+        config = plan_stage(mesh.STAGE, asked, inputs, SilentProgress())
         made.append(extract_mesh(config, source, SilentProgress()).mesh)
     return {"texture": (made[0], True), "vertex": (made[0], False), "untextured": (made[1], False)}
 
@@ -180,7 +180,7 @@ def main() -> None:
     for path in given.workspaces:
         workspace = Workspace.existing(path)
         keys = workspace.read_run().keys
-        folders = {stage: workspace.folder(stage, keys[stage]) for stage in mesh.INPUTS}
+        folders = {stage: workspace.folder(stage, keys[stage]) for stage in mesh.STAGE.inputs}
         source = load(folders, SilentProgress())
         pictures = None if given.pictures is None else given.pictures / path.stem
         record.add(set=path.stem, **figures(source, folders, given, pictures))

@@ -219,7 +219,7 @@ def fitted(image: np.ndarray, truth: np.ndarray, used: np.ndarray) -> np.ndarray
 def rows(workspace: Workspace, rivals: list[Path], pictures: Path | None) -> Iterator[dict[str, Any]]:
     """A row for each mesh of a set, ours first."""
     keys = workspace.read_run().keys
-    source = load({stage: workspace.folder(stage, keys[stage]) for stage in mesh.INPUTS}, SilentProgress())
+    source = load({stage: workspace.folder(stage, keys[stage]) for stage in mesh.STAGE.inputs}, SilentProgress())
     results = [our_result(workspace, source), *(rival_result(folder, workspace, source) for folder in rivals)]
     photos = [photo_of(view, source.scene, source.ingest, source.info) for view in source.scene.of_split("test")]
     found = [photo_scores(results, source, photo, pictures) for photo in photos]

@@ -153,7 +153,7 @@ def main() -> None:
         folders = trained(scene, given.folder, name, given.steps)
         source = load(folders, SilentProgress())
         asked = Config(resolution=given.resolution, texture_size=0)
-        config = plan_stage(mesh, asked, folders, SilentProgress())
+        config = plan_stage(mesh.STAGE, asked, folders, SilentProgress())
         facts = {"set": name, "steps": given.steps, "width": given.width, "resolution": config.resolution}
         record.add(**facts, **row(scene, source, config, given))
 

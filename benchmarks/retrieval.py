@@ -96,7 +96,7 @@ def measure(config: sfm.Config, folder: Path, truth: dict[str, np.ndarray]) -> d
     """Run stage sfm; its row of the table."""
     progress, sfm_folder = Timed(), folder / str(config.matcher)
     begin = time.perf_counter()
-    result = run_stage(sfm, config, {"ingest": folder / "ingest"}, sfm_folder, progress)
+    result = run_stage(sfm.STAGE, config, {"ingest": folder / "ingest"}, sfm_folder, progress)
     seconds = time.perf_counter() - begin
     model = read_model(sfm_folder / "sparse")
     true = np.stack([truth[image.file] for image in model.images])[:, :, 3]

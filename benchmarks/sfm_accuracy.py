@@ -128,7 +128,7 @@ def measure(data: Path, config: sfm.Config, turned: int | None, contrast: float 
             photos = Path(scratch, "foggy")
         ingest.run(ingest.Config(photos=photos), {}, folders["ingest"], PlainDisplay())
         begin = time.perf_counter()
-        result = run_stage(sfm, config, folders, folders["sfm"], PlainDisplay())
+        result = run_stage(sfm.STAGE, config, folders, folders["sfm"], PlainDisplay())
         seconds = time.perf_counter() - begin
         model = read_model(folders["sfm"] / "sparse")
         if transforms.exists():

@@ -78,7 +78,7 @@ def ours(photos: Path, folder: Path) -> tuple[Path, dict[str, float], str]:
     ingest.run(ingest.Config(photos=photos), {}, folders["ingest"], progress)
     parts = {"ingest": time.perf_counter() - begin}
     progress = Timed()
-    run_stage(sfm, sfm.Config(), folders, folders["sfm"], progress)
+    run_stage(sfm.STAGE, sfm.Config(), folders, folders["sfm"], progress)
     parts["sfm"] = time.perf_counter() - begin - parts["ingest"]
     return folders["sfm"] / "sparse", parts, progress.parts()
 

@@ -1,1 +1,2 @@
-"""A package per stage: its ``Config`` and ``run()``, which loads, computes and saves; ``io``, ``hardware`` for all."""
+"""A package per stage: its ``Config``, ``run()``, which loads, computes and saves, and what it declares, ``STAGE``;
+``io`` and ``hardware`` for all."""

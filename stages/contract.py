@@ -1,39 +1,8 @@
 """What a stage is and what it declares: all that stages share with the runner.
 
-A stage is a package in this folder and one line in pipeline/engine/stage_list.py. Its ``__init__.py`` has
-
-* ``INPUTS: tuple[str, ...]``: the stages whose finished folders it reads;
-* ``VERSION: int``: raised whenever the same config and inputs would give other outputs than before;
-* ``EXIT_CODE: int``: of a command that this stage ends with an error;
-* ``RESUMES: bool``: whether it can go on from its own half-written folder (otherwise it starts clean);
-* ``PUBLISHED: tuple[str, ...]``: the outputs or records shown in ``<workspace>/output/``;
-* ``Config``: its settings, a :class:`StageConfig`;
-* ``run(config, inputs, folder, progress) -> StageResult``: reads ``inputs[stage]`` (finished folders), writes its
-  results into ``folder`` alone, raises :class:`StageError` for everything a user can act on. ``config`` is planned. Two
-  exceptions: ``--more`` reads the finished training that it continues, which is no input, from the same workspace
-  (stages/train/more.py), and pixel stores, a cache, lie beside ingest's folder (stages/io/pixel_store.py);
-
-and may have (:data:`DEFAULTS` hold otherwise)
-
-* ``more_inputs(config) -> tuple[str, ...]``: further inputs that its options ask for, treated as ``INPUTS`` are: they
-  run first and enter the key (:func:`inputs_of`);
-* ``DISPENSABLE: tuple[str, ...]``: those of its inputs that may fail. Without the result of one the stage runs all the
-  same, under another key; a run goes on when a stage fails that all later ones can do without;
-* ``OPTIONAL_INPUTS: tuple[str, ...]``: stages whose finished folders it reads if they happen to be there. They do not
-  run for it, do not enter its key, and are withheld where damaged: no output may depend on them;
-* ``NOT_HASHED: tuple[str, ...]``: options that cannot change the result and so do not enter the key;
-* ``plan(config, inputs, progress) -> Config``: replaces every ``None`` ("choose for me") by a value, where it must by
-  timing a piece of the work. :func:`plan_stage` calls it, once, before the stage's first run; the answer is kept in
-  run.json and enters the stage's key, so a run that was killed continues with the same choice;
-* ``ON_REQUEST: bool``: it runs only where it is named, or where an option of another stage asks for it
-  (``more_inputs``), and no budget pays for it;
-* ``SUMMARY: bool``: it shows the whole run: of its ``INPUTS`` it takes what is there, with records and timings, and the
-  account of a budget; it is brought up to date after whichever stage was run alone;
-* ``expected_seconds(config, workload) -> float | None``: what it takes without a budget; None where nobody can tell;
-* ``FLEXIBLE: Flexible``: it fills whatever seconds a budget gives it;
-* ``budget_seconds(left) -> float``: for a stage that is not flexible: its ``seconds`` in a run with a budget;
-* ``limiting_seconds(options) -> float | None``: for a stage whose ``seconds`` have a limit without a budget as well:
-  what that limit follows from, None for no limit.
+A stage is a package in this folder and one line in pipeline/engine/stage_list.py. Its ``__init__.py`` has its settings,
+``Config``, what it does, ``run``, perhaps ``plan`` and what it tells of its time, and ends with ``STAGE``, a
+:class:`Stage`, which says all that the runner has to know of it.
 
 Importing a stage must be cheap: torch, pycolmap, kornia and their like are imported inside ``plan`` and ``run``.
 """
@@ -42,8 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
-from typing import Annotated, Any, NamedTuple, Protocol, Self, TypeVar
+from typing import Annotated, Any, Generic, NamedTuple, Protocol, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 from pydantic.fields import FieldInfo
@@ -178,18 +146,6 @@ class StageResult:
 
 
 Inputs = Mapping[str, Path]
-C = TypeVar("C", bound=StageConfig)
-
-
-def plan_stage(stage: ModuleType, config: C, inputs: Inputs, progress: Progress) -> C:
-    """``config`` with every "choose for me" answered, by the stage's ``plan``; as it is for a stage without one."""
-    plan = declared(stage, "plan")
-    return config if plan is None else plan(config, inputs, progress)
-
-
-def run_stage(stage: ModuleType, config: StageConfig, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
-    """Plan and run a stage without a workspace: ``inputs`` are finished folders, ``folder`` an empty one."""
-    return stage.run(plan_stage(stage, config, inputs, progress), inputs, folder, progress)
 
 
 # --- what a stage declares about its time
@@ -254,38 +210,87 @@ class Flexible(NamedTuple):
     work: Callable[[float, float], float] = _as_given  # its option ``seconds`` by wall time and time to decode photos
 
 
-def _unknown(config: StageConfig, workload: Workload) -> float | None:
-    return None
+# --- what a stage declares
+
+C = TypeVar("C", bound=StageConfig)
 
 
-def _nothing_more(config: StageConfig) -> tuple[str, ...]:
-    return ()
+@dataclass(frozen=True, kw_only=True)
+class Stage(Generic[C]):
+    """All that a stage declares."""
+
+    name: str
+    """Of its package, its command and its table of options."""
+    inputs: tuple[str, ...]
+    """The stages whose finished folders it reads."""
+    more_inputs: Callable[[C], tuple[str, ...]] = lambda _: ()
+    """Further inputs that its options ask for, treated as ``inputs`` are: they run first and enter the key."""
+    dispensable: tuple[str, ...] = ()
+    """Those of its inputs that may fail. Without the result of one it runs all the same, under another key; a run goes
+    on when a stage fails that all later ones can do without."""
+    optional_inputs: tuple[str, ...] = ()
+    """Stages whose finished folders it reads if they happen to be there. They do not run for it, do not enter its key,
+    and are withheld where damaged: no output may depend on them."""
+    version: int
+    """Raised whenever the same config and inputs would give other outputs than before."""
+    exit_code: int
+    """Of a command that this stage ends with an error."""
+    resumes: bool = False
+    """Whether it can go on from its own half-written folder; otherwise it starts clean."""
+    published: tuple[str, ...]
+    """The outputs or records shown in ``<workspace>/output/``."""
+    config: type[C]
+    """Its settings."""
+    not_hashed: tuple[str, ...] = ()
+    """Options that cannot change the result and so do not enter the key."""
+    plan: Callable[[C, Inputs, Progress], C] | None = None
+    """Replaces every ``None`` ("choose for me") by a value, where it must by timing a piece of the work. It is called
+    once, before the stage's first run; the answer is kept in run.json and enters the stage's key, so a run that was
+    killed continues with the same choice."""
+    run: Callable[[C, Inputs, Path, Progress], StageResult]
+    """``run(config, inputs, folder, progress)`` reads ``inputs[stage]`` (finished folders), writes its results into
+    ``folder`` alone, and raises :class:`StageError` for everything a user can act on. ``config`` is planned. Two
+    exceptions: ``--more`` reads the finished training that it continues, which is no input, from the same workspace
+    (stages/train/more.py), and pixel stores, a cache, lie beside ingest's folder (stages/io/pixel_store.py)."""
+    on_request: bool = False
+    """It runs only where it is named, or where an option of another stage asks for it (``more_inputs``), and no budget
+    pays for it."""
+    summary: bool = False
+    """It shows the whole run: of its ``inputs`` it takes what is there, with records and timings, and the account of a
+    budget; it is brought up to date after whichever stage was run alone."""
+    expected_seconds: Callable[[C, Workload], float | None] = lambda *_: None
+    """What it takes without a budget; None where nobody can tell."""
+    flexible: Flexible | None = None
+    """It fills whatever seconds a budget gives it."""
+    budget_seconds: Callable[[BudgetLeft], float] | None = None
+    """For a stage that is not flexible but has a share of a budget: its option ``seconds`` there."""
+    limiting_seconds: Callable[[Mapping[str, Any]], float | None] = lambda _: None
+    """For a stage whose ``seconds`` have a limit without a budget as well: what that limit follows from in the options
+    of all stages, None for no limit."""
+
+    def inputs_of(self, config: C) -> tuple[str, ...]:
+        """The stages whose finished folders it reads under these options."""
+        return (*self.inputs, *self.more_inputs(config))
+
+    @property
+    def has_share(self) -> bool:
+        """Whether a budget gives it seconds, all or some of those that it takes."""
+        return self.flexible is not None or self.budget_seconds is not None
+
+    def fills_its_time(self, config: C) -> bool:
+        """Whether it takes what a budget gives it."""
+        return self.flexible is not None and config.time_is_open
+
+    def is_exempt(self, config: C) -> bool:
+        """Whether it is charged to no run's budget."""
+        return self.on_request or config.exempt_from_budget
 
 
-def _unlimited(options: Mapping[str, Any]) -> float | None:
-    return None
+def plan_stage(stage: Stage[C], config: C, inputs: Inputs, progress: Progress) -> C:
+    """``config`` with every "choose for me" answered, by the stage's ``plan``; as it is for a stage without one."""
+    return config if stage.plan is None else stage.plan(config, inputs, progress)
 
 
-DEFAULTS: dict[str, Any] = {
-    "OPTIONAL_INPUTS": (),
-    "more_inputs": _nothing_more,
-    "DISPENSABLE": (),
-    "NOT_HASHED": (),
-    "plan": None,
-    "ON_REQUEST": False,
-    "SUMMARY": False,
-    "expected_seconds": _unknown,
-    "FLEXIBLE": None,
-    "budget_seconds": None,
-    "limiting_seconds": _unlimited,
-}
-
-
-def declared(stage: ModuleType, name: str) -> Any:
-    """What a stage declares under ``name``, or the default."""
-    return getattr(stage, name, DEFAULTS[name])
-
-
-def inputs_of(stage: ModuleType, config: StageConfig) -> tuple[str, ...]:
-    """The stages whose finished folders a stage reads under these options."""
-    return (*stage.INPUTS, *declared(stage, "more_inputs")(config))
+def run_stage(stage: Stage[C], config: C, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
+    """Plan and run a stage without a workspace: ``inputs`` are finished folders, ``folder`` an empty one."""
+    return stage.run(plan_stage(stage, config, inputs, progress), inputs, folder, progress)

@@ -94,7 +94,7 @@ MESH_AND_TRADEOFF: dict[str, str] = {
 
 PIPELINE: dict[str, str] = {
     r"\b_?(MOST|LEAST|FEWEST|LARGEST|FARTHEST)_[A-Z]": "MAX_, MIN_",
-    r"\b(UNKEYED|LINKS|NEEDS)\b": "NOT_HASHED, PUBLISHED, INPUTS",
+    r"\b(UNKEYED|LINKS|NEEDS)\b": "not_hashed, published, inputs",
     r"--like\b": "--match-exposure",
 }
 

@@ -304,7 +304,7 @@ def with_flags(settings: Settings, parsed: Settings, command: str, words: Sequen
                 table, given = table.setdefault(parent, {}), getattr(given, parent)
             table[option] = getattr(given, option)
         try:
-            settings = settings.model_copy(update={stage: STAGES[stage].Config.model_validate(values)})
+            settings = settings.model_copy(update={stage: STAGES[stage].config.model_validate(values)})
         except ValidationError as error:
             raise UsageError(f"{wrong_options(error, f'--{stage}')} (pipeline {command} --help)") from error
     return settings
@@ -313,7 +313,7 @@ def with_flags(settings: Settings, parsed: Settings, command: str, words: Sequen
 def _named_options(stage: str, words: Sequence[str]) -> Iterator[str]:
     """The dotted names of the stage's options that ``words`` give, which may be spelt with underscores."""
     flags = {word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")}
-    for name, option in STAGES[stage].Config.flags():
+    for name, option in STAGES[stage].config.flags():
         *parents, last = f"{stage}.{name}".replace("_", "-").split(".")
         own = [".".join([*parents, last]), ".".join([*parents, f"no-{last}"])]
         aliases = [alias for entry in option.metadata for alias in getattr(entry, "aliases", None) or ()]

@@ -218,7 +218,7 @@ def _options_of_each(words: Sequence[str]) -> list[str]:
 
 def _check_budget(budget: float | None, stages: Sequence[str], until: str | None, root: Path | str) -> None:
     """Raises UsageError where a ``budget`` is given for ``stages`` that none covers."""
-    if budget is not None and (studies := [stage for stage in stages if stage_list.is_on_request(stage)]):
+    if budget is not None and (studies := [stage for stage in stages if stage_list.STAGES[stage].on_request]):
         stage = studies[0]
         what = f"no budget covers {stage}, which has its own time limit (--{stage}.seconds)"
         if stage != until:
@@ -227,9 +227,9 @@ def _check_budget(budget: float | None, stages: Sequence[str], until: str | None
 
 
 def _keeping_studies(settings: Settings, root: Path, words: Sequence[str], file: Collection[str] = ()) -> Settings:
-    """The settings with the recorded options of the stages ON_REQUEST but those that the command's ``words`` or tables
+    """The settings with the recorded options of the stages on request but those that the command's ``words`` or tables
     of the ``file`` of --config name: a run that does not ask for them leaves what they found where it is."""
-    studies = [stage for stage in stage_list.STAGES if stage_list.is_on_request(stage)]
+    studies = [name for name, stage in stage_list.STAGES.items() if stage.on_request]
     named = {*file, *(stage for stage in studies if any(word.startswith(f"--{stage}.") for word in words))}
     if not os.path.isfile(root / RUN_FILE):
         return settings
@@ -339,7 +339,7 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
         update = {"cameras": given.cameras.absolute()}
         settings = settings.model_copy(update={"render": settings.render.model_copy(update=update)})
     stages = stage_list.needed_for(stage, dict(settings))
-    shown = [name for name in workspace.read_run().keys if stage_list.is_summary(name) and name not in stages]
+    shown = [name for name in workspace.read_run().keys if stage_list.STAGES[name].summary and name not in stages]
     stages = [*stages, *shown]
     with choose_display(given.common.json) as display:
         force = frozenset({stage}) if given.force else frozenset[str]()

@@ -8,4 +8,4 @@ DEFECT, USAGE, WORKSPACE, BATCH, INTERRUPT, TERMINATED = 1, 2, 3, 4, 130, 143
 
 def of_stage(name: str) -> int:
     """That this stage failed."""
-    return STAGES[name].EXIT_CODE
+    return STAGES[name].exit_code

@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from stages.contract import StageConfig
+from stages.contract import Stage, StageConfig
 
 
 class DamagedInputs(Exception):
@@ -24,8 +23,7 @@ class NotReady(Exception):
 class Job:
     """One stage with everything that decides its key."""
 
-    stage: str
-    module: ModuleType
+    stage: Stage
     config: StageConfig
     key_config: dict[str, Any]
     inputs: dict[str, str]  # upstream stage -> outputs digest

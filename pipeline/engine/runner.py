@@ -15,19 +15,18 @@ from pipeline.engine.job import DamagedInputs, Job, NotReady
 from pipeline.engine.keys import ContentIndex, config_for_key, digest, stage_key
 from pipeline.engine.manifests import BadManifest, Manifest
 from pipeline.engine.settings import Settings
-from pipeline.engine.stage_list import SOURCE, STAGES, command_that_makes, is_summary, needed_for
+from pipeline.engine.stage_list import SOURCE, STAGES, command_that_makes, needed_for
 from pipeline.engine.workspace import Workspace
 from pipeline.schedule.budget import RUNNING, Account
 from pipeline.schedule.forecast import (
     Forecast,
     Left,
     forecast_run,
-    is_exempt,
     limited_seconds,
     photos_of,
     time_behind_plan,
 )
-from stages.contract import StageConfig, StageError, Workload, declared, inputs_of, plan_stage, reading_seconds
+from stages.contract import StageConfig, StageError, Workload, plan_stage, reading_seconds
 from stages.hardware.device import processors
 from stages.ingest.sources import find_source, is_gone
 from stages.io.photos import read_photos
@@ -70,7 +69,7 @@ class Runner:
 
     def _inputs(self, stage: str) -> tuple[str, ...]:
         """The stages that ``stage`` reads under the options of this run."""
-        return inputs_of(STAGES[stage], self.options[stage])
+        return STAGES[stage].inputs_of(self.options[stage])
 
     def set_budget(self, total: float | None, before: float) -> None:
         """Make ``total`` seconds the budget of this workspace, None for no limit. The same as before goes on.
@@ -89,7 +88,7 @@ class Runner:
         where the photos or a file that a setting names cannot be read: the stage that reads it says so."""
         try:
             to_run = [name for name in stages if name in again or self.found(name) is None]
-            if all(is_summary(name, STAGES) for name in to_run):
+            if all(STAGES[name].summary for name in to_run):
                 return Forecast([], {})
             photos = photos_of(self.options[SOURCE])
             if photos is None:
@@ -125,8 +124,7 @@ class Runner:
     def _options_digest(self) -> str:
         """Of what a budget is kept for: a study has its own time."""
         recorded = run_file.portable(self.run_file.options, self.workspace.root)
-        of_run = [stage for stage in STAGES if not declared(STAGES[stage], "ON_REQUEST")]
-        return digest({stage: recorded[stage] for stage in of_run})
+        return digest({name: recorded[name] for name, stage in STAGES.items() if not stage.on_request})
 
     def run(
         self,
@@ -192,8 +190,8 @@ class Runner:
     def _can_go_without(self, stage: str) -> bool:
         """Whether later stages of this run read the result of ``stage``, and none of them needs it."""
         later = self.stages[self.stages.index(stage) + 1 :]
-        readers = [name for name in later if stage in self._inputs(name) and not is_summary(name, STAGES)]
-        return bool(readers) and all(stage in declared(STAGES[name], "DISPENSABLE") for name in readers)
+        readers = [name for name in later if stage in self._inputs(name) and not STAGES[name].summary]
+        return bool(readers) and all(stage in STAGES[name].dispensable for name in readers)
 
     def _close_account(self, whole_run: bool) -> None:
         """A run that ended by itself, well or not, is over; one stage of an interrupted run does not end it."""
@@ -203,19 +201,19 @@ class Runner:
 
     def _unlink_outdated(self) -> None:
         """Take out of ``output/`` what belongs to other settings than the current ones."""
-        for stage, module in STAGES.items():
+        for name, stage in STAGES.items():
             try:
-                self._upstream(stage)
+                self._upstream(name)
             except NotReady:
-                self.workspace.unlink_outputs(module.PUBLISHED)
+                self.workspace.unlink_outputs(stage.published)
             except StageError:  # photos or a file that a setting names cannot be read: said where that stage runs
                 continue
 
     def _unlink_after(self, stage: str) -> None:
         """Take out of ``output/`` what rests on ``stage``, which was running; nothing where none was."""
-        for later, module in STAGES.items():
-            if stage and (is_summary(later, STAGES) or stage in needed_for(later, self.options, STAGES)):
-                self.workspace.unlink_outputs(module.PUBLISHED)
+        for name, later in STAGES.items():
+            if stage and (later.summary or stage in needed_for(name, self.options, STAGES)):
+                self.workspace.unlink_outputs(later.published)
 
     def _bring_up_to_date(self, stage: str) -> bool:
         self.started[stage] = time.monotonic()
@@ -223,7 +221,7 @@ class Runner:
         try:
             with worded(stage):
                 job, manifest, ran = self._found_or_made(stage)
-                self.workspace.link_outputs(self.workspace.folder(stage, job.key), job.module.PUBLISHED)
+                self.workspace.link_outputs(self.workspace.folder(stage, job.key), job.stage.published)
                 self.workspace.write_run(self.run_file)
                 self.index.save()
         finally:
@@ -244,7 +242,7 @@ class Runner:
         except DamagedInputs:
             self._rebuild_inputs(stage)
             return self._found_or_made(stage)
-        self.workspace.unlink_outputs(job.module.PUBLISHED)
+        self.workspace.unlink_outputs(job.stage.published)
         return job, self._execute(job), True
 
     def _check_inputs(self, stage: str, folders: dict[str, Path]) -> None:
@@ -293,22 +291,21 @@ class Runner:
 
         Raises NotReady where an upstream result is missing, or where settings are left open and may not be planned.
         """
-        module, summary = STAGES[stage], is_summary(stage, STAGES)
-        read = self._inputs(stage)
-        needed = () if summary else {*read} - {*declared(module, "DISPENSABLE")}
+        declared, read = STAGES[stage], self._inputs(stage)
+        needed = () if declared.summary else {*read} - {*declared.dispensable}
         upstream = {name: m for name in read if (m := self._upstream(name, name in needed)) is not None}
-        names = declared(module, "OPTIONAL_INPUTS")
+        names = declared.optional_inputs
         optional = {name: m for name in names if (m := self._upstream(name, needed=False)) is not None}
         folders = {name: self.workspace.folder(name, m.key) for name, m in (upstream | optional).items()}
         # A summary shows timings and logs too, so it depends on whole manifests and not only on outputs.
-        if summary:
+        if declared.summary:
             inputs = {name: manifests.file_sha256(folders[name] / manifests.NAME) for name in upstream}
         else:
             inputs = {name: m.outputs_digest for name, m in upstream.items()}
         config = self._planned(stage, inputs, folders, may_plan)
         key_config = self._config_for_key(stage, config)
-        key = stage_key(stage, module.VERSION, key_config, inputs)
-        return Job(stage, module, config, key_config, inputs, folders, key)
+        key = stage_key(stage, declared.version, key_config, inputs)
+        return Job(declared, config, key_config, inputs, folders, key)
 
     def _upstream(self, name: str, needed: bool = True) -> Manifest | None:
         """The current result of ``name``; where it is not ``needed`` None without one, else NotReady is raised."""
@@ -320,36 +317,36 @@ class Runner:
                 if needed:
                     raise NotReady(name) from None
             except StageError:  # a file that a setting names is gone: the stage says so where it runs
-                rests_on_it = (name in self._inputs(later) for later in STAGES if not is_summary(later, STAGES))
+                rests_on_it = (name in self._inputs(later) for later in STAGES if not STAGES[later].summary)
                 if needed or any(rests_on_it):
                     raise
         return self.done.get(name)
 
     def _planned(self, stage: str, inputs: dict[str, str], folders: dict[str, Path], may_plan: bool) -> StageConfig:
         """The stage's config with every "choose for me" answered: from run.json, or by its plan."""
-        module, options = STAGES[stage], getattr(self.settings, stage)
-        if is_summary(stage, STAGES) and (account := self.run_file.budget):
-            return module.Config.model_validate(options.model_dump() | {"budget": account.shown(STAGES)})
-        if declared(module, "plan") is None:
+        declared, options = STAGES[stage], self.options[stage]
+        if declared.summary and (account := self.run_file.budget):
+            return declared.config.model_validate(options.model_dump() | {"budget": account.shown(STAGES)})
+        if declared.plan is None:
             return options
         options_for_key = self._config_for_key(stage, options)
         total = None if self.budget is None else self.budget.total
-        time_given = time_behind_plan(STAGES, stage, self.options, total)
-        asked = digest({"version": module.VERSION, "options": options_for_key, "inputs": inputs} | time_given)
+        time_given = time_behind_plan(declared, self.options, total)
+        asked = digest({"version": declared.version, "options": options_for_key, "inputs": inputs} | time_given)
         plans = self.run_file.plans.setdefault(stage, {})
         if asked in plans:
             # Taken as given now: paths, for the plan was made for equal content, wherever that lay then, and what is
             # part of no key. But seconds stay: where they are open, a budget gave the plan its own.
             now = {name for name, value in options if isinstance(value, Path)}
-            now |= {*declared(module, "NOT_HASHED")} - {"seconds"}
-            return module.Config.model_validate(plans[asked] | options.model_dump(include=now))
+            now |= {*declared.not_hashed} - {"seconds"}
+            return declared.config.model_validate(plans[asked] | options.model_dump(include=now))
         if not may_plan:
             raise NotReady(stage)
         self._check_inputs(stage, folders)
         self._begin_work(stage)
         clock = time.monotonic()
         with counting(self.workspace.root / RUNNING):
-            config = plan_stage(module, self._with_time(stage, options), folders, self.display)
+            config = plan_stage(declared, self._with_time(stage, options), folders, self.display)
         self.planning[stage] = time.monotonic() - clock
         plans[asked] = config.model_dump(mode="json")
         self.workspace.write_run(self.run_file)
@@ -357,9 +354,9 @@ class Runner:
 
     def _begin_work(self, stage: str) -> None:
         """From here on ``stage`` costs time of the budget, which nothing does that was found finished."""
-        if self.budget is None or self.works_on == stage or is_exempt(STAGES, stage, self.options[stage]):
+        if self.budget is None or self.works_on == stage or STAGES[stage].is_exempt(self.options[stage]):
             return
-        if is_summary(stage, STAGES) and self.budget.over:  # it shows that account
+        if STAGES[stage].summary and self.budget.over:  # it shows that account
             return
         self.works_on, self.charged = stage, True
         self.budget.continue_as(self._options_digest(), self._photos_digest())
@@ -378,28 +375,27 @@ class Runner:
 
     def _with_time(self, stage: str, options: StageConfig) -> StageConfig:
         """``options`` with the seconds that the run leaves for the stage, where these are open."""
-        module = STAGES[stage]
-        has_share = declared(module, "FLEXIBLE") is not None or declared(module, "budget_seconds") is not None
-        if not options.time_is_open or not has_share:
+        declared = STAGES[stage]
+        if not options.time_is_open or not declared.has_share:
             return options
         photos = read_photos(self.workspace.folder(SOURCE, self.done[SOURCE].key))
         reading = reading_seconds(sum(photo.width * photo.height for photo in photos) / 1e6, processors())
         if self.budget is None:
-            seconds = limited_seconds(STAGES, stage, self.options, self.times, reading)
+            seconds = limited_seconds(declared, self.options, self.times, reading)
             return options.model_copy(update={"seconds": seconds})
         # An input that has to be rebuilt is none of the stages that were asked for.
         order = list(STAGES)
         after = [name for name in self.stages if order.index(name) > order.index(stage)]
-        to_come = {name: self.times.get(name) for name in after if not is_exempt(STAGES, name, self.options[name])}
+        to_come = {name: self.times.get(name) for name in after if not STAGES[name].is_exempt(self.options[name])}
         what_is_left = {stage: None, **to_come}
-        main = (how := declared(module, "FLEXIBLE")) is not None and how.max_share >= 1
+        main = (how := declared.flexible) is not None and how.max_share >= 1
         if main and (why := self.budget.shortage(STAGES, what_is_left, reading)):
             self.display.note("pipeline.budget-exceeded", f"the budget is too short: {why}")
         return options.model_copy(update={"seconds": self.budget.give(STAGES, stage, to_come, reading)})
 
     def _config_for_key(self, stage: str, config: StageConfig) -> dict[str, Any]:
         replaced = {"photos": self._photos_digest()} if stage == SOURCE else {}
-        return config_for_key(config, self.index, replaced, declared(STAGES[stage], "NOT_HASHED"))
+        return config_for_key(config, self.index, replaced, STAGES[stage].not_hashed)
 
     def _photos_digest(self) -> str:
         """Digest of the photos' names and bytes; the last known one where the photos are gone but were ingested."""
@@ -419,9 +415,9 @@ class Runner:
     def find_finished(self, job: Job) -> Manifest | None:
         """The finished result for this job, if there is one; a damaged one is quarantined and said aloud."""
         try:
-            manifest = self.workspace.finished(job.stage, job.key, deep=self.verify)
+            manifest = self.workspace.finished(job.stage.name, job.key, deep=self.verify)
             if manifest is not None and self.verify:
-                self.checked.add(job.stage)
+                self.checked.add(job.stage.name)
             return manifest
         except BadManifest as problem:
             self.display.note("pipeline.quarantined", f"quarantined as .bad and rebuilt: {problem}")
@@ -430,24 +426,25 @@ class Runner:
     def _execute(self, job: Job) -> Manifest:
         import stages.sfm.colmap  # noqa: F401 -- pycolmap changes how signals are handled: before ours are set
 
-        partial, folder = self.workspace.partial(job.stage, job.key), self.workspace.folder(job.stage, job.key)
-        if job.stage not in self.force and (manifest := self.workspace.complete(partial, folder, job.key)):
+        name, stage = job.stage.name, job.stage
+        partial, folder = self.workspace.partial(name, job.key), self.workspace.folder(name, job.key)
+        if name not in self.force and (manifest := self.workspace.complete(partial, folder, job.key)):
             return manifest
-        self._begin_work(job.stage)
-        before = elapsed(partial / ATTEMPTS) + self.planning.pop(job.stage, 0.0)
-        if partial.exists() and not (job.module.RESUMES and job.stage not in self.force):
+        self._begin_work(name)
+        before = elapsed(partial / ATTEMPTS) + self.planning.pop(name, 0.0)
+        if partial.exists() and not (stage.resumes and name not in self.force):
             shutil.rmtree(partial)
         partial.mkdir(parents=True, exist_ok=True)
         write_elapsed(partial / ATTEMPTS, before)
         self.workspace.write_run(self.run_file)
         started = datetime.now(UTC)
-        self.running = job.stage
+        self.running = name
         with recorded(partial), counting(self.workspace.root / RUNNING), counting(partial / ATTEMPTS) as spent:
-            result = job.module.run(job.config, job.folders, partial, self.display)
+            result = stage.run(job.config, job.folders, partial, self.display)
         outputs = manifests.describe_outputs(partial, result.outputs)
         manifest = Manifest(
-            stage=job.stage,
-            version=job.module.VERSION,
+            stage=name,
+            version=stage.version,
             key=job.key,
             config=job.config.model_dump(mode="json"),
             inputs=job.inputs,
@@ -457,12 +454,12 @@ class Runner:
             facts=result.facts,
             line=result.line,
             seconds=round(spent(), 3),
-            expected=None if (expected := self.times.get(job.stage)) is None else round(expected, 1),
+            expected=None if (expected := self.times.get(name)) is None else round(expected, 1),
             started=started.isoformat(timespec="seconds"),
             machine=machine.facts(),
         )
         self.workspace.finish(partial, folder, manifest)
-        self.checked.add(job.stage)
-        self.force -= {job.stage}
+        self.checked.add(name)
+        self.force -= {name}
         self.running = ""
         return manifest

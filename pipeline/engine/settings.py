@@ -20,5 +20,5 @@ else:
         "Settings",
         __doc__='The options of every stage, as the user gave them: None still means "choose for me".',
         __config__=ConfigDict(extra="forbid", frozen=True),
-        **{name: (module.Config, module.Config()) for name, module in STAGES.items()},
+        **{name: (stage.config, stage.config()) for name, stage in STAGES.items()},
     )

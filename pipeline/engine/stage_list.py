@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import ModuleType
 
 from stages import (
     depth,
@@ -19,24 +18,24 @@ from stages import (
     train,
     viewer,
 )
-from stages.contract import StageConfig, declared, inputs_of
+from stages.contract import Stage, StageConfig
 
-STAGES: dict[str, ModuleType] = {
-    module.__name__.rpartition(".")[2]: module
-    for module in (
-        ingest,
-        sfm,
-        normalise,
-        scale,
-        depth,
-        effects,
-        train,
-        evaluate,
-        render,
-        mesh,
-        viewer,
-        tradeoff,
-        report,
+STAGES: dict[str, Stage] = {
+    stage.name: stage
+    for stage in (
+        ingest.STAGE,
+        sfm.STAGE,
+        normalise.STAGE,
+        scale.STAGE,
+        depth.STAGE,
+        effects.STAGE,
+        train.STAGE,
+        evaluate.STAGE,
+        render.STAGE,
+        mesh.STAGE,
+        viewer.STAGE,
+        tradeoff.STAGE,
+        report.STAGE,
     )
 }
 
@@ -44,25 +43,15 @@ SOURCE = next(iter(STAGES))
 """The stage that reads PHOTOS, which its key holds by their content."""
 
 
-def is_summary(stage: str, stages: Mapping[str, ModuleType] = STAGES) -> bool:
-    """Whether ``stage`` shows the whole run, from whatever is there."""
-    return declared(stages[stage], "SUMMARY")
-
-
-def is_on_request(stage: str) -> bool:
-    """Whether ``stage`` runs only where it is named."""
-    return declared(STAGES[stage], "ON_REQUEST")
-
-
-def needed_for(stage: str, options: Mapping[str, StageConfig], stages: Mapping[str, ModuleType] = STAGES) -> list[str]:
+def needed_for(stage: str, options: Mapping[str, StageConfig], stages: Mapping[str, Stage] = STAGES) -> list[str]:
     """``stage`` and everything it depends on under these ``options`` of each stage, in order; a summary is written from
     whatever is there."""
-    if is_summary(stage, stages):
+    if stages[stage].summary:
         return [stage]
     wanted = {stage}
     for name in reversed(list(stages)):
         if name in wanted:
-            wanted.update(inputs_of(stages[name], options[name]))
+            wanted.update(stages[name].inputs_of(options[name]))
     return [name for name in stages if name in wanted]
 
 
@@ -70,8 +59,8 @@ def up_to(stage: str, options: Mapping[str, StageConfig] | None = None) -> list[
     """All stages from the first to ``stage``, in order; of those on request only ``stage`` itself and what the others
     read by their ``options``."""
     names = list(STAGES)
-    asked = [name for name in names[: names.index(stage) + 1] if name == stage or not is_on_request(name)]
-    read = {one for name in asked if options for one in declared(STAGES[name], "more_inputs")(options[name])}
+    asked = [name for name in names[: names.index(stage) + 1] if name == stage or not STAGES[name].on_request]
+    read = {one for name in asked if options for one in STAGES[name].more_inputs(options[name])}
     return [name for name in names if name in asked or name in read]
 
 

@@ -11,7 +11,7 @@ from pipeline.engine.manifests import BadManifest, Manifest
 from pipeline.engine.runner import Runner
 from pipeline.engine.stage_list import STAGES, command_that_makes
 from pipeline.engine.workspace import Workspace
-from stages.contract import KEY_LENGTH, Options, StageError, declared, inputs_of
+from stages.contract import KEY_LENGTH, Options, StageError
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
 
 def _why_unplanned(runner: Runner, stage: str, last: Manifest) -> str:
     """Why a stage whose inputs are there has not the result it needs, while its open options are not chosen yet."""
-    read = inputs_of(STAGES[stage], runner.options[stage])
+    read = STAGES[stage].inputs_of(runner.options[stage])
     inputs = {name: runner.done[name].outputs_digest for name in read if name in runner.done}
     return "; ".join(_other_inputs(inputs, last)) or "its automatic options are chosen again"
 
@@ -86,10 +86,10 @@ def _other_inputs(now: dict[str, str], last: Manifest) -> list[str]:
 def differences(job: Job, last: Manifest) -> list[str]:
     """Which part of the key changed between the last result and now."""
     found = []
-    if last.version != job.module.VERSION:
-        found.append(f"the program has changed (version {last.version} → {job.module.VERSION} of this stage)")
-    now: dict[str, Any] = job.config.model_dump(mode="json", exclude=set(declared(job.module, "NOT_HASHED")))
-    found += [f"{job.stage}.{change}" for change in _changes(job.config, now, last.config)]
+    if last.version != job.stage.version:
+        found.append(f"the program has changed (version {last.version} → {job.stage.version} of this stage)")
+    now: dict[str, Any] = job.config.model_dump(mode="json", exclude=set(job.stage.not_hashed))
+    found += [f"{job.stage.name}.{change}" for change in _changes(job.config, now, last.config)]
     found += _other_inputs(job.inputs, last)
     if not found and last.key != job.key:
         found.append("a file named in its options has changed")
@@ -120,7 +120,7 @@ def explain(workspace: Workspace, runner: Runner, stage: str) -> list[str]:
         lines.append("It would run: it has never finished in this workspace.")
     else:
         lines += ["It would run because:", *(f"  {reason}" for reason in differences(job, last))]
-    lines.append(f"key {job.key[:KEY_LENGTH]} = version {job.module.VERSION}")
+    lines.append(f"key {job.key[:KEY_LENGTH]} = version {job.stage.version}")
     lines += [f"  config {name} = {value}" for name, value in sorted(job.key_config.items())]
     lines += [f"  input  {name} = {value[:KEY_LENGTH]}" for name, value in sorted(job.inputs.items())]
     return lines

@@ -72,7 +72,7 @@ class Workspace:
         try:
             self.root.mkdir(parents=True, exist_ok=True)
             _refuse_links(self.root)
-            names = [name for module in STAGES.values() for name in module.PUBLISHED]
+            names = [name for stage in STAGES.values() for name in stage.published]
             self._adopt_copies(names)
             self._reject_foreign_files(names)
             self._lock.acquire(timeout=LOCK_SECONDS)

@@ -7,17 +7,16 @@ quicker structure from motion, a kill. What each stage takes is its own to decla
 
 from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
 
 from pydantic import BaseModel, ConfigDict
 
-from stages.contract import BudgetLeft, Flexible, declared
+from stages.contract import BudgetLeft, Flexible, Stage
 from stages.io.amounts import duration
 from stages.io.stopwatch import elapsed
 
 RUNNING = ".alive"  # in the workspace: what the running stage has cost so far (stages/io/stopwatch.py)
 
-Stages = Mapping[str, ModuleType]
+Stages = Mapping[str, Stage]
 Times = Mapping[str, float | None]  # expected seconds by stage; None: flexible, or unknown
 
 
@@ -27,20 +26,17 @@ def allocated_seconds(stages: Stages, stage: str, left: float, to_come: Times, t
     ``to_come`` are the stages after it: what one is expected to take, None where it is flexible. Never less than the
     least that makes sense, whatever is left.
     """
-    flexible = {name: _flexible(stages, name) for name, seconds in to_come.items() if seconds is None}
-    after = {name: how for name, how in flexible.items() if how is not None}
+    flexible = (stages[name].flexible for name, seconds in to_come.items() if seconds is None)
+    after = [how for how in flexible if how is not None]
     free = left - sum(seconds or 0.0 for seconds in to_come.values())
-    how = _flexible(stages, stage)
+    how, budget_seconds = stages[stage].flexible, stages[stage].budget_seconds
     if how is None:
-        reserved = sum(_min_seconds(later, reading) for later in after.values())
-        return declared(stages[stage], "budget_seconds")(BudgetLeft(total, free, reserved, reading))
-    shares = how.share + sum(later.share for later in after.values())
-    reserved = sum(_reserved(later, free * later.share / shares) for later in after.values())
+        assert budget_seconds is not None, f"{stage} has no share of a budget"
+        reserved = sum(_min_seconds(later, reading) for later in after)
+        return budget_seconds(BudgetLeft(total, free, reserved, reading))
+    shares = how.share + sum(later.share for later in after)
+    reserved = sum(_reserved(later, free * later.share / shares) for later in after)
     return max(_min_seconds(how, reading), min(free - reserved, how.max_share * total))
-
-
-def _flexible(stages: Stages, stage: str) -> Flexible | None:
-    return declared(stages[stage], "FLEXIBLE")
 
 
 def _min_seconds(how: Flexible, reading: float) -> float:
@@ -55,7 +51,7 @@ def min_total(stages: Stages, times: Times, reading: float) -> float:
     """The smallest budget that can be kept: everything that is expected, and the least of all that is flexible."""
 
     def least(stage: str) -> float:
-        how = _flexible(stages, stage)
+        how = stages[stage].flexible
         return _min_seconds(how, reading) if how else 0.0
 
     return sum(least(stage) if seconds is None else seconds for stage, seconds in times.items())
@@ -65,7 +61,7 @@ def max_total(stages: Stages, times: Times, total: float) -> float:
     """What all that is expected can take at most of a budget of ``total``."""
 
     def most(stage: str) -> float:
-        how = _flexible(stages, stage)
+        how = stages[stage].flexible
         return how.max_share * total if how else 0.0
 
     return sum(most(stage) if seconds is None else seconds for stage, seconds in times.items())
@@ -117,7 +113,7 @@ class Account(BaseModel):
         """The option ``seconds`` of ``stage`` by what is left, which is allocated; see :func:`allocated_seconds`."""
         wall = allocated_seconds(stages, stage, self.left, to_come, self.total, reading)
         self.allocate(stage, wall)
-        how = _flexible(stages, stage)
+        how = stages[stage].flexible
         return round(how.work(wall, reading) if how else wall, 1)
 
     def shortage(self, stages: Stages, times: Times, reading: float) -> str | None:
@@ -142,6 +138,6 @@ class Account(BaseModel):
         """Total, allocated and spent, for a summary, which cannot know what it takes itself."""
 
         def others(seconds: Mapping[str, float]) -> dict[str, float]:
-            return {s: v for s, v in seconds.items() if s not in stages or not declared(stages[s], "SUMMARY")}
+            return {s: v for s, v in seconds.items() if s not in stages or not stages[s].summary}
 
         return {"seconds": self.total, "allocated": others(self.allocated), "spent": others(self.spent)}

@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 from pipeline.schedule.budget import Stages, Times, max_total, min_total
-from stages.contract import BudgetLeft, Photos, StageConfig, StageError, Workload, declared
+from stages.contract import BudgetLeft, Photos, Stage, StageConfig, StageError, Workload
 from stages.ingest.sources import find_source
 from stages.io.amounts import duration, rough_duration
 
@@ -34,50 +34,35 @@ def photos_of(config: "IngestConfig") -> Photos | None:
 def expected_times(stages: Stages, workload: Workload, budgeted: bool) -> dict[str, float | None]:
     """Seconds by stage; None where nobody can tell and, in a run with a budget, of those that fill what they get."""
     return {
-        name: None
-        if budgeted and fills_its_time(stages, name, workload.options[name])
-        else _own(stages, name, workload)
+        name: None if budgeted and stage.fills_its_time(workload.options[name]) else _own(stage, workload)
         for name, stage in stages.items()
-        if not declared(stage, "ON_REQUEST")
+        if not stage.on_request
     }
 
 
-def _own(stages: Stages, name: str, workload: Workload) -> float | None:
-    return declared(stages[name], "expected_seconds")(workload.options[name], workload)
+def _own(stage: Stage, workload: Workload) -> float | None:
+    return stage.expected_seconds(workload.options[stage.name], workload)
 
 
-def fills_its_time(stages: Stages, name: str, options: StageConfig) -> bool:
-    """Whether the stage takes what a budget gives it."""
-    return declared(stages[name], "FLEXIBLE") is not None and options.time_is_open
-
-
-def is_exempt(stages: Stages, name: str, options: StageConfig) -> bool:
-    """Whether the stage is charged to no run's budget."""
-    return declared(stages[name], "ON_REQUEST") or options.exempt_from_budget
-
-
-def limited_seconds(
-    stages: Stages, name: str, options: Mapping[str, StageConfig], times: Times, reading: float
-) -> float | None:
+def limited_seconds(stage: Stage, options: Mapping[str, StageConfig], times: Times, reading: float) -> float | None:
     """The option ``seconds`` of a stage that has a limit in a run without a budget as well, by what the run takes; None
     for no limit, also where nothing is known of the run."""
-    if not times or declared(stages[name], "limiting_seconds")(options) is None:
+    if not times or stage.budget_seconds is None or stage.limiting_seconds(options) is None:
         return None
     total = sum(seconds or 0.0 for seconds in times.values())
-    return declared(stages[name], "budget_seconds")(BudgetLeft(total, total, 0.0, reading))
+    return stage.budget_seconds(BudgetLeft(total, total, 0.0, reading))
 
 
-def time_behind_plan(
-    stages: Stages, name: str, options: Mapping[str, StageConfig], total: float | None
-) -> dict[str, float]:
+def time_behind_plan(stage: Stage, options: Mapping[str, StageConfig], total: float | None) -> dict[str, float]:
     """The time that a plan of a stage rests on: the budget of ``total`` seconds, the stage's own option, or what limits
     it without a budget; {} without. It is part of no key; with another one the stage plans anew."""
-    if not options[name].time_is_open:
-        seconds = getattr(options[name], "seconds", None)
+    own = options[stage.name]
+    if not own.time_is_open:
+        seconds = getattr(own, "seconds", None)
         return {} if seconds is None else {"seconds": seconds}
     if total is not None:
         return {"budget": total}
-    limit = declared(stages[name], "limiting_seconds")(options)
+    limit = stage.limiting_seconds(options)
     return {} if limit is None else {"limit": limit}
 
 
@@ -98,18 +83,18 @@ class Left(NamedTuple):
 
 def forecast_run(stages: Stages, to_run: Collection[str], workload: Workload, budget: Left | None) -> Forecast:
     """How long the stages ``to_run`` take: a message where that can be told, and seconds by stage."""
-    exempt = [name for name in to_run if is_exempt(stages, name, workload.options[name])]
-    if exempt and all(name in exempt or declared(stages[name], "SUMMARY") for name in to_run):
+    exempt = [name for name in to_run if stages[name].is_exempt(workload.options[name])]
+    if exempt and all(name in exempt or stages[name].summary for name in to_run):
         budget = None
     times = expected_times(stages, workload, budget is not None)
-    ahead = {name: times[name] if name in times else _own(stages, name, workload) for name in stages if name in to_run}
+    ahead = {name: times[name] if name in times else _own(stages[name], workload) for name in stages if name in to_run}
     known = [seconds for seconds in ahead.values() if seconds is not None]
     unknown = [name for name in ahead.keys() - exempt if ahead[name] is None]
     if budget is None:
         total = sum(known)
         message = f"done in about {rough_duration(total)}, about {_clock(total)}"
         return Forecast([message] if len(known) == len(ahead) else [], times)
-    if not all(fills_its_time(stages, name, workload.options[name]) for name in unknown) or any(
+    if not all(stages[name].fills_its_time(workload.options[name]) for name in unknown) or any(
         ahead[name] is None for name in exempt
     ):
         return Forecast([], times)
@@ -134,9 +119,7 @@ def budget_message(stages: Stages, budget: Left, times: Times, reading: float, e
         return f"{given}, too short for these photos: {soonest}; every stage does its minimum"
     finish = _clock(min(left, most) + extra)
     # Others have no use for more than a share, and may well be done sooner.
-    uses_all = any(
-        s is None and (how := declared(stages[n], "FLEXIBLE")) and how.max_share >= 1 for n, s in times.items()
-    )
+    uses_all = any(s is None and (how := stages[n].flexible) and how.max_share >= 1 for n, s in times.items())
     return f"{given}, done at {f'about {finish}' if uses_all else f'{finish} at the latest'}"
 
 

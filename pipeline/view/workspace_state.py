@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Literal
 from pipeline.engine import manifests
 from pipeline.engine.manifests import BadManifest, Manifest
 from pipeline.engine.workspace import Workspace
+from stages import viewer
 from stages.contract import StageError
 from stages.train.live import LIVE, STATE, ask_to_finish, touch
-from stages.viewer import INPUTS
 from stages.viewer.page import binary
 
 if TYPE_CHECKING:
@@ -136,7 +136,8 @@ class WorkspaceState:
         from stages.viewer.live import LiveContents
 
         keys = self._keys()
-        folders = {name: self.workspace.folder(name, keys[name]) for name in INPUTS if name in keys and name != "train"}
+        read = [name for name in viewer.STAGE.inputs if name in keys and name != "train"]
+        folders = {name: self.workspace.folder(name, keys[name]) for name in read}
         there = {name: folder for name, folder in folders.items() if (folder / manifests.NAME).is_file()}
         if "normalise" not in there:
             return None

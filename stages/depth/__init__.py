@@ -8,15 +8,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from stages.contract import Auto, Inputs, Progress, StageConfig, StageResult, Workload
-
-INPUTS = ("ingest", "normalise")
-VERSION = 3
-EXIT_CODE = 20
-RESUMES = True
-ON_REQUEST = True
-PUBLISHED = ("points.ply",)
-NOT_HASHED = ("seconds",)  # it decides the size of the depth maps, and that enters the key
+from stages.contract import Auto, Inputs, Progress, Stage, StageConfig, StageResult, Workload
 
 PAIRS_PER_PHOTO = 2.5  # with four neighbours each: most pairs are chosen from both sides, and matched once
 PAIR_SECONDS, PHOTO_SECONDS = 0.35, 0.5  # of a core, at the default size
@@ -56,3 +48,19 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     from stages.depth.estimation import estimate_depth
 
     return estimate_depth(config, inputs, folder, progress)
+
+
+STAGE = Stage(
+    name="depth",
+    inputs=("ingest", "normalise"),
+    version=3,
+    exit_code=20,
+    resumes=True,
+    published=("points.ply",),
+    config=Config,
+    not_hashed=("seconds",),  # it decides the size of the depth maps, and that enters the key
+    plan=plan,
+    run=run,
+    on_request=True,
+    expected_seconds=expected_seconds,
+)

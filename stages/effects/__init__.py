@@ -11,25 +11,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator
 from tyro.conf import Suppress
 
-from stages.contract import (
-    Auto,
-    BudgetLeft,
-    Inputs,
-    Progress,
-    StageConfig,
-    StageResult,
-    Workload,
-)
+from stages.contract import Auto, BudgetLeft, Inputs, Progress, Stage, StageConfig, StageResult, Workload
 from stages.effects.effect_list import EFFECTS
 from stages.io.amounts import duration
 from stages.io.files import read_json, read_scene
 
-INPUTS = ("ingest", "sfm", "normalise")
-VERSION = 19
-EXIT_CODE = 13
-RESUMES = False
-PUBLISHED = ("effects.json",)
-NOT_HASHED = ("seconds",)  # it decides how many A/B runs, and that enters the key
 # Of the run: what the stage may take, and of what is free no more than FREE_SHARE. Of that, beside reading the photos,
 # statistics take one or two seconds, timing a pilot as much.
 BUDGET_SHARE, FREE_SHARE, STATISTICS_SECONDS = 0.15, 0.25, 4.0
@@ -124,3 +110,19 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 
     scene, registration = read_scene(inputs["normalise"]), read_json(inputs["sfm"] / "registration.json")
     return study(config, scene, registration, inputs, folder, progress)
+
+
+STAGE = Stage(
+    name="effects",
+    inputs=("ingest", "sfm", "normalise"),
+    version=19,
+    exit_code=13,
+    published=("effects.json",),
+    config=Config,
+    not_hashed=("seconds",),  # it decides how many A/B runs, and that enters the key
+    plan=plan,
+    run=run,
+    expected_seconds=expected_seconds,
+    budget_seconds=budget_seconds,
+    limiting_seconds=limiting_seconds,
+)

@@ -11,17 +11,9 @@ from typing import Literal
 
 from pydantic import Field
 
-from stages.contract import Auto, Flexible, Inputs, Progress, SilentProgress, StageConfig, StageResult, Workload
+from stages.contract import Auto, Flexible, Inputs, Progress, SilentProgress, Stage, StageConfig, StageResult, Workload
 from stages.evaluate.seconds import SHARE, other_seconds
 from stages.train import trained_seconds
-
-INPUTS = ("ingest", "normalise", "train")
-VERSION = 17
-EXIT_CODE = 15
-RESUMES = False
-PUBLISHED = ("metrics.json", "renders", "errors")
-NOT_HASHED = ("seconds",)  # it decides how much of the photos is scored, and that enters the key
-FLEXIBLE = Flexible(share=0.05, min_seconds=3.0, max_seconds=60.0)
 
 
 class Config(StageConfig):
@@ -80,3 +72,18 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     scorer = load(config, inputs, progress)
     images = score(scorer, folder, progress, partial(load, config, dict(inputs), SilentProgress()))
     return save(scorer, images, folder)
+
+
+STAGE = Stage(
+    name="evaluate",
+    inputs=("ingest", "normalise", "train"),
+    version=17,
+    exit_code=15,
+    published=("metrics.json", "renders", "errors"),
+    config=Config,
+    not_hashed=("seconds",),  # it decides how much of the photos is scored, and that enters the key
+    plan=plan,
+    run=run,
+    expected_seconds=expected_seconds,
+    flexible=Flexible(share=0.05, min_seconds=3.0, max_seconds=60.0),
+)

@@ -4,27 +4,12 @@ from pathlib import Path
 
 from pydantic import Field
 
-from stages.contract import (
-    Inputs,
-    OptionalSourcePath,
-    Progress,
-    SourcePath,
-    StageConfig,
-    StageResult,
-    Workload,
-)
+from stages.contract import Inputs, OptionalSourcePath, Progress, SourcePath, Stage, StageConfig, StageResult, Workload
 from stages.ingest.sources import find_source
 from stages.io.files import write_json
 from stages.io.photos import write_photos
 
-INPUTS: tuple[str, ...] = ()
-VERSION = 22
-EXIT_CODE = 10
-RESUMES = False
 NOTES = "notes.json"
-PUBLISHED = ("photos.json", NOTES, "images", "masks", "opaque")
-# What it decides here, which files are photos and which frames they are, is in the digest that stands for ``photos``.
-NOT_HASHED = ("cameras",)
 MIN_FRAMES = 3  # of a video, as sfm needs
 
 
@@ -73,3 +58,18 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         line=conversion.messages.summary(source, photos, converted.rejected),
         facts=conversion.messages.facts(source, photos, converted.rejected),
     )
+
+
+STAGE = Stage(
+    name="ingest",
+    inputs=(),
+    version=22,
+    exit_code=10,
+    published=("photos.json", NOTES, "images", "masks", "opaque"),
+    config=Config,
+    # What it decides here, which files are photos and which frames they are, is in the digest that stands for
+    # ``photos``.
+    not_hashed=("cameras",),
+    run=run,
+    expected_seconds=expected_seconds,
+)

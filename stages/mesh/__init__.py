@@ -11,20 +11,12 @@ from typing import Literal
 
 from pydantic import Field, field_validator
 
-from stages.contract import Auto, Flexible, Inputs, Progress, StageConfig, StageError, StageResult, Workload
+from stages.contract import Auto, Flexible, Inputs, Progress, Stage, StageConfig, StageError, StageResult, Workload
 from stages.hardware.device import processors
 from stages.io.files import read_scene
 from stages.mesh.face_count import default_faces
 from stages.scale import metres_per_unit
 from stages.train import trained_seconds
-
-INPUTS = ("ingest", "normalise", "scale", "train")
-VERSION = 21
-EXIT_CODE = 17
-RESUMES = False
-PUBLISHED = ("mesh.glb", "mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "mesh.stl", "mesh.3mf")
-NOT_HASHED = ("seconds",)  # it decides the resolution, and that enters the key
-FLEXIBLE = Flexible(share=0.12, min_seconds=8.0, max_seconds=60.0)
 
 # Of a texture, besides decoding the photos twice: in all, and of a core for each photo. Fox with 100,000 faces takes 5
 # and 19 s of a core for its 43 training photos (docs/experiments/mesh.md).
@@ -167,3 +159,18 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     extracted = extract_mesh(config, source, progress)
     progress.update("writing", 0.95)
     return save(config, extracted, source, folder)
+
+
+STAGE = Stage(
+    name="mesh",
+    inputs=("ingest", "normalise", "scale", "train"),
+    version=21,
+    exit_code=17,
+    published=("mesh.glb", "mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "mesh.stl", "mesh.3mf"),
+    config=Config,
+    not_hashed=("seconds",),  # it decides the resolution, and that enters the key
+    plan=plan,
+    run=run,
+    expected_seconds=expected_seconds,
+    flexible=Flexible(share=0.12, min_seconds=8.0, max_seconds=60.0),
+)

@@ -4,13 +4,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from stages.contract import Auto, Inputs, Progress, StageConfig, StageResult, Workload
-
-INPUTS = ("ingest", "sfm")
-VERSION = 17
-EXIT_CODE = 12
-RESUMES = False
-PUBLISHED = ("transforms.json", "scene.json")
+from stages.contract import Auto, Inputs, Progress, Stage, StageConfig, StageResult, Workload
 
 
 class Config(StageConfig):
@@ -42,3 +36,15 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     from stages.normalise.scene_frame import normalise_scene
 
     return normalise_scene(config, inputs, folder, progress)
+
+
+STAGE = Stage(
+    name="normalise",
+    inputs=("ingest", "sfm"),
+    version=17,
+    exit_code=12,
+    published=("transforms.json", "scene.json"),
+    config=Config,
+    run=run,
+    expected_seconds=expected_seconds,
+)

@@ -5,18 +5,10 @@ from pathlib import Path
 
 from pydantic import Field, field_validator
 
-from stages.contract import Auto, Flexible, Inputs, Progress, StageConfig, StageResult, Workload
+from stages.contract import Auto, Flexible, Inputs, Progress, Stage, StageConfig, StageResult, Workload
 from stages.io.files import read_scene, write_json
 from stages.render.plan import MAX_GIVEN_FPS, MIN_WIDTH, PathKind, even_width
 from stages.train import trained_seconds
-
-INPUTS = ("normalise", "train")
-VERSION = 15
-EXIT_CODE = 16
-RESUMES = False
-PUBLISHED = ("video.mp4", "depth.mp4", "path.json")
-NOT_HASHED = ("seconds",)  # it decides how many frames and how large, and these enter the key
-FLEXIBLE = Flexible(share=0.15, min_seconds=4.0, max_seconds=300.0)
 
 
 class Config(StageConfig):
@@ -114,3 +106,18 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     summary = f"{facts['path']}, {facts['frames']} frames {facts['width']}×{facts['height']}"
     summary += "" if appearance is None else f" · {appearance}"
     return StageResult(outputs, f"{summary} · rendered at {frames_per_second:.2g} frames/s", ("speed.json",), facts)
+
+
+STAGE = Stage(
+    name="render",
+    inputs=("normalise", "train"),
+    version=15,
+    exit_code=16,
+    published=("video.mp4", "depth.mp4", "path.json"),
+    config=Config,
+    not_hashed=("seconds",),  # it decides how many frames and how large, and these enter the key
+    plan=plan,
+    run=run,
+    expected_seconds=expected_seconds,
+    flexible=Flexible(share=0.15, min_seconds=4.0, max_seconds=300.0),
+)

@@ -10,15 +10,8 @@ from typing import Annotated
 from pydantic import Field
 from tyro.conf import Suppress
 
-from stages.contract import READING_SECONDS, Inputs, Progress, StageConfig, StageResult, Workload
+from stages.contract import READING_SECONDS, Inputs, Progress, Stage, StageConfig, StageResult, Workload
 from stages.io.files import write_json
-
-INPUTS = ("ingest", "sfm", "normalise", "scale", "effects", "train", "evaluate", "render", "mesh", "viewer", "tradeoff")
-VERSION = 17
-EXIT_CODE = 18
-RESUMES = False
-SUMMARY = True
-PUBLISHED = ("report.html", "summary.json")
 
 
 class Account(StageConfig):
@@ -53,7 +46,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     from stages.report.page import page, read_results, summarise
 
     progress.update("reading results")
-    results = read_results(inputs, INPUTS)
+    results = read_results(inputs, STAGE.inputs)
     summary = summarise(results)
     summary["budget"] = config.budget and config.budget.model_dump()
     write_json(folder / "summary.json", summary)
@@ -63,3 +56,28 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     doubt = "The cameras are doubtful. " if summary["cameras_doubtful"] else ""
     line = f"{doubt}{summary['verdict']}"
     return StageResult(("report.html", "summary.json"), line, facts={"verdict": line})
+
+
+STAGE = Stage(
+    name="report",
+    inputs=(
+        "ingest",
+        "sfm",
+        "normalise",
+        "scale",
+        "effects",
+        "train",
+        "evaluate",
+        "render",
+        "mesh",
+        "viewer",
+        "tradeoff",
+    ),
+    version=17,
+    exit_code=18,
+    published=("report.html", "summary.json"),
+    config=Config,
+    run=run,
+    summary=True,
+    expected_seconds=expected_seconds,
+)

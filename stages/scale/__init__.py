@@ -10,16 +10,10 @@ from typing import Annotated
 from pydantic import Field, field_validator
 from tyro.conf import UseAppendAction, arg
 
-from stages.contract import Auto, Inputs, Progress, StageConfig, StageResult, Workload
+from stages.contract import Auto, Inputs, Progress, Stage, StageConfig, StageResult, Workload
 from stages.io.files import read_json
 from stages.scale.lengths import parse_length, parse_point
 from stages.scale.marker_names import parse_marker
-
-INPUTS = ("ingest", "sfm", "normalise")
-VERSION = 4
-EXIT_CODE = 22
-RESUMES = False
-PUBLISHED = ("scale.json",)
 
 
 class Config(StageConfig):
@@ -73,3 +67,15 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     from stages.scale.measurement import measure_scale
 
     return measure_scale(config, inputs, folder, progress)
+
+
+STAGE = Stage(
+    name="scale",
+    inputs=("ingest", "sfm", "normalise"),
+    version=4,
+    exit_code=22,
+    published=("scale.json",),
+    config=Config,
+    run=run,
+    expected_seconds=expected_seconds,
+)

@@ -11,22 +11,13 @@ from stages.contract import (
     Inputs,
     OptionalSourcePath,
     Progress,
+    Stage,
     StageConfig,
     StageResult,
     Workload,
 )
 from stages.io.files import write_json
 from stages.sfm.pairs import MAX_EXHAUSTIVE, Matcher
-
-INPUTS = ("ingest",)
-VERSION = 32
-EXIT_CODE = 11
-RESUMES = True
-PUBLISHED = ("sparse", "registration.json")
-# Both may make the stage skip a retry strategy; its line then says so. They stay out of the key, so that a run with
-# another limit finds the matches of the one before it and resumes from them. ``seconds`` also sets the quality of
-# feature extraction, which enters the key by options of its own (max_image_size, max_features).
-NOT_HASHED = ("max_seconds", "seconds")
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
 Direction = Literal["world-from-camera", "camera-from-world"]
@@ -192,3 +183,22 @@ def _line(registration: dict[str, Any]) -> str:
     line += "" if error is None else f", {error:.2f} px"
     line += f" · {registration['camera_model']}"
     return line + (f" · {points:,} points".replace(",", " ") if points else "")
+
+
+STAGE = Stage(
+    name="sfm",
+    inputs=("ingest",),
+    version=32,
+    exit_code=11,
+    resumes=True,
+    published=("sparse", "registration.json"),
+    config=Config,
+    # Both may make the stage skip a retry strategy; its line then says so. They stay out of the key, so that a run with
+    # another limit finds the matches of the one before it and resumes from them. ``seconds`` also sets the quality of
+    # feature extraction, which enters the key by options of its own (max_image_size, max_features).
+    not_hashed=("max_seconds", "seconds"),
+    plan=plan,
+    run=run,
+    expected_seconds=expected_seconds,
+    budget_seconds=budget_seconds,
+)

@@ -11,16 +11,8 @@ from typing import Annotated
 from pydantic import Field
 from tyro.conf import Suppress
 
-from stages.contract import Auto, Inputs, Progress, StageConfig, StageResult, Workload
+from stages.contract import Auto, Inputs, Progress, Stage, StageConfig, StageResult, Workload
 from stages.effects.decisions import Space
-
-INPUTS = ("ingest", "normalise", "effects")
-OPTIONAL_INPUTS = ("train",)
-VERSION = 16
-EXIT_CODE = 19
-RESUMES = True
-ON_REQUEST = True
-PUBLISHED = ("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ablation.png")
 
 
 class Config(StageConfig):
@@ -76,3 +68,19 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 
     outcome = run_study(config, inputs, folder, progress)
     return save_study(config, outcome, folder, workspace=inputs["normalise"].resolve().parents[1].name)
+
+
+STAGE = Stage(
+    name="tradeoff",
+    inputs=("ingest", "normalise", "effects"),
+    optional_inputs=("train",),
+    version=16,
+    exit_code=19,
+    resumes=True,
+    published=("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ablation.png"),
+    config=Config,
+    plan=plan,
+    run=run,
+    on_request=True,
+    expected_seconds=expected_seconds,
+)

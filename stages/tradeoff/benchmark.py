@@ -142,7 +142,7 @@ def train_and_score(run: Run, benchmark: Benchmark, inputs: Inputs, folder: Path
     figures: dict[str, Any] = {"failed": None}
     with peak_memory() as peak:
         try:
-            result = run_stage(train, train.Config(**run.options), inputs, work, progress)
+            result = run_stage(train.STAGE, train.Config(**run.options), inputs, work, progress)
         except StageError as error:
             if error.code not in RUN_FAILURES:
                 what = f"the study stopped at {run.label}: {error.what}"

@@ -377,7 +377,7 @@ def measure_speeds(scene: Scene, inputs: Inputs, seconds: float, progress: Progr
 def _planned(name: str, space: Space, inputs: Inputs, progress: Progress) -> train.Config:
     """What stage train makes of a variant; nothing is left for it to choose by time."""
     asked = train.Config(steps=1, downscale=1.0, **train_options(name, space))  # type: ignore[arg-type]
-    return plan_stage(train, asked, inputs, _NoNotes(progress))
+    return plan_stage(train.STAGE, asked, inputs, _NoNotes(progress))
 
 
 def _multiplications(config: train.Config) -> float:

@@ -2,15 +2,8 @@
 
 from pathlib import Path
 
-from stages.contract import Flexible, Inputs, Progress, StageResult, Workload
+from stages.contract import Flexible, Inputs, Progress, Stage, StageResult, Workload
 from stages.train.config import Config
-
-INPUTS = ("ingest", "normalise", "effects")
-VERSION = 30
-EXIT_CODE = 14
-RESUMES = True
-PUBLISHED = ("curve.json",)
-NOT_HASHED = ("checkpoint_seconds", "devices", "tensorboard")
 
 # Its own seconds count steps alone. Beside reading the photos, timing the first steps takes about STARTING_SECONDS,
 # validation and checkpoints 1.5 to 2 % (fox, fountain_p11 and sceaux_castle, three minutes each).
@@ -21,11 +14,6 @@ def step_seconds(wall: float, reading: float) -> float:
     """Seconds of training steps in a stage that takes ``wall`` seconds in all, at least half of these, and ``reading``
     of them to read the photos."""
     return max(wall / 2, (wall - STARTING_SECONDS - reading) / (1 + OVERHEAD))
-
-
-# A user waits for the field, so it gets most of what is left; figures, a video and a mesh are there to see it by. A
-# training of less than half a minute is worth none.
-FLEXIBLE = Flexible(share=0.68, min_seconds=30.0, max_share=1.0, reads_photos=True, work=step_seconds)
 
 
 def expected_seconds(config: Config, workload: Workload) -> float | None:
@@ -70,3 +58,22 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         loaded = training.load(config, inputs, folder, progress, ranks)
         training.compute(loaded)
     return training.save(loaded, folder, progress)
+
+
+STAGE = Stage(
+    name="train",
+    inputs=("ingest", "normalise", "effects"),
+    more_inputs=more_inputs,
+    version=30,
+    exit_code=14,
+    resumes=True,
+    published=("curve.json",),
+    config=Config,
+    not_hashed=("checkpoint_seconds", "devices", "tensorboard"),
+    plan=plan,
+    run=run,
+    expected_seconds=expected_seconds,
+    # A user waits for the field, so it gets most of what is left; figures, a video and a mesh are there to see it by. A
+    # training of less than half a minute is worth none.
+    flexible=Flexible(share=0.68, min_seconds=30.0, max_share=1.0, reads_photos=True, work=step_seconds),
+)

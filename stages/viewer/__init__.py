@@ -9,14 +9,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from stages.contract import READING_SECONDS, Inputs, Progress, StageConfig, StageResult, Workload
-
-INPUTS = ("ingest", "normalise", "scale", "train")
-VERSION = 7
-EXIT_CODE = 21
-RESUMES = False
-DISPENSABLE = ("mesh",)
-PUBLISHED = ("viewer.html",)
+from stages.contract import READING_SECONDS, Inputs, Progress, Stage, StageConfig, StageResult, Workload
 
 
 class Config(StageConfig):
@@ -53,3 +46,17 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     contents = load(config, inputs, progress)
     progress.update("writing the page", 0.95)
     return page.save(contents, folder)
+
+
+STAGE = Stage(
+    name="viewer",
+    inputs=("ingest", "normalise", "scale", "train"),
+    more_inputs=more_inputs,
+    dispensable=("mesh",),
+    version=7,
+    exit_code=21,
+    published=("viewer.html",),
+    config=Config,
+    run=run,
+    expected_seconds=expected_seconds,
+)

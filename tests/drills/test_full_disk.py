@@ -4,7 +4,7 @@ import json
 import shutil
 import subprocess
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -57,14 +57,13 @@ class FullAt:
     leave: int
 
     def __call__(self) -> None:
-        module = stage_list.STAGES[self.stage]
-        run = module.run
+        stage = stage_list.STAGES[self.stage]
 
         def run_on_a_full_disk(*arguments: Any) -> Any:
             fill_up(self.disk, self.leave)
-            return run(*arguments)
+            return stage.run(*arguments)
 
-        vars(module)["run"] = run_on_a_full_disk
+        stage_list.STAGES[self.stage] = replace(stage, run=run_on_a_full_disk)
 
 
 LARGE = ("ingest", "train", "evaluate", "render", "mesh")  # stages that write more than a page or two
@@ -78,7 +77,7 @@ def test_a_full_disk_at_every_stage(chain: Chain, small_disk: Path, stage: str, 
     program = chain.start(workspace, says=says, prepare=FullAt(stage, small_disk, int(share * size)))
     code = program.wait()
     error = error_of(program)
-    assert (error["stage"], code) == (stage, stage_list.STAGES[stage].EXIT_CODE)
+    assert (error["stage"], code) == (stage, stage_list.STAGES[stage].exit_code)
     assert results(workspace) == before, "nothing finished is lost"
     (small_disk / "ballast").unlink()
     if share:
@@ -92,7 +91,7 @@ def test_a_disk_that_fills_up_somewhere(chain: Chain, small_disk: Path, leave: i
     program = chain.start(workspace, says=small_disk.parent / "says")
     code = program.wait()
     error = error_of(program)
-    assert code == stage_list.STAGES[error["stage"]].EXIT_CODE if error["stage"] else code == 3
+    assert code == stage_list.STAGES[error["stage"]].exit_code if error["stage"] else code == 3
     ballast.unlink()
     assert chain.lost(workspace, says=small_disk.parent / "says") == []
 

@@ -39,7 +39,7 @@ def test_what_does_not_fit_is_refused_beforehand(chain: Chain, tmp_path: Path, s
     workspace = copy_workspace(chain.workspace, tmp_path / "w.nerf")
     words = [stage, str(workspace), "--json", *options.split()]
     program = Program(words, tmp_path / "says", LimitedTo(3 << 28))
-    assert program.wait() == STAGES[stage].EXIT_CODE, program.said + program.complaints
+    assert program.wait() == STAGES[stage].exit_code, program.said + program.complaints
     (error,) = [event for event in program.events() if event["event"] == "error"]
     assert error["what"].startswith("not enough memory for ") and hint in error["hint"]
     assert error["why"].count(" GB") == 2

@@ -4,8 +4,9 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import redirect_stdout
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import trimesh
 
 from pipeline.cli.commands import run_command
 from pipeline.engine.stage_list import STAGES
-from stages.contract import StageConfig, declared
+from stages.contract import Stage, StageConfig, plan_stage
 from tests.small_scenes import write_blender_scene
 from tests.test_vocabulary import RETIRED, offenders
 from tests.video_files import read_video
@@ -33,13 +34,15 @@ def planned() -> Iterator[Counter[str]]:
     """How often each stage was planned."""
     calls = Counter[str]()
 
-    def counted(name: str, plan: Callable[..., StageConfig]) -> Callable[..., StageConfig]:
-        return lambda *given: calls.update([name]) or plan(*given)
+    def counted(stage: Stage) -> Stage:
+        def plan(*given: Any) -> StageConfig:
+            calls.update([stage.name])
+            return plan_stage(stage, *given)
+
+        return stage if stage.plan is None else replace(stage, plan=plan)
 
     with pytest.MonkeyPatch.context() as patch:
-        for name, stage in STAGES.items():
-            if plan := declared(stage, "plan"):
-                patch.setattr(stage, "plan", counted(name, plan))
+        patch.setattr("pipeline.engine.runner.STAGES", {name: counted(stage) for name, stage in STAGES.items()})
         yield calls
 
 

@@ -55,7 +55,7 @@ def found(
     inputs = {"ingest": folder / "ingest"}
     inputs["ingest"].mkdir()
     ingest.run(ingest.Config(photos=folder / "photos"), {}, inputs["ingest"], Listening())
-    run_stage(sfm, config or sfm.Config(), inputs, folder / "sfm", Listening())
+    run_stage(sfm.STAGE, config or sfm.Config(), inputs, folder / "sfm", Listening())
     return folder / "sfm", notes
 
 

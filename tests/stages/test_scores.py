@@ -25,8 +25,8 @@ def test_a_study_scores_as_evaluate_does(tmp_path: Path, progress: Any, monkeypa
     own, scored = tmp_path / "train", tmp_path / "evaluate"
     for folder in (own, scored):
         folder.mkdir()
-    run_stage(train, train.Config(steps=70, downscale=1.0, grid=GRID), photos, own, progress)
-    facts = run_stage(evaluate, evaluate.Config(fraction=1), photos | {"train": own}, scored, progress).facts
+    run_stage(train.STAGE, train.Config(steps=70, downscale=1.0, grid=GRID), photos, own, progress)
+    facts = run_stage(evaluate.STAGE, evaluate.Config(fraction=1), photos | {"train": own}, scored, progress).facts
     made = benchmark.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), None, 1000, 2.0)
     figures = benchmark.score(own, made, progress)
     assert figures["psnr"] == pytest.approx(facts["psnr"], abs=0.001)
@@ -36,12 +36,12 @@ def test_a_cluster_scores_the_same(tmp_path: Path, progress: Any, ray_cluster: s
     photos, _ = photographed(tmp_path / "photos", channels=4)
     own = tmp_path / "train"
     own.mkdir()
-    run_stage(train, train.Config(steps=5, downscale=1.0, grid=GRID), photos, own, progress)
+    run_stage(train.STAGE, train.Config(steps=5, downscale=1.0, grid=GRID), photos, own, progress)
 
     def scored(name: str) -> dict[str, bytes]:
         folder = tmp_path / name
         folder.mkdir()
-        run_stage(evaluate, evaluate.Config(fraction=1), photos | {"train": own}, folder, progress)
+        run_stage(evaluate.STAGE, evaluate.Config(fraction=1), photos | {"train": own}, folder, progress)
         return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*.*")}
 
     here = scored("here")

@@ -1,12 +1,13 @@
 """Three tiny stages for testing the runner: a number is written, doubled, and doubled again with an offset."""
 
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
+import pytest
 from pydantic import BaseModel
 
-from stages.contract import Progress, StageConfig, StageError, StageResult
+from stages.contract import Inputs, Progress, Stage, StageConfig, StageError, StageResult
 from stages.io.files import read_json, write_json
 
 calls: list[str] = []
@@ -28,7 +29,7 @@ class TrainConfig(StageConfig):
     die_at: int | None = None
 
 
-def _run_ingest(config: IngestConfig, inputs: dict[str, Path], folder: Path, progress: Any) -> StageResult:
+def _run_ingest(config: IngestConfig, inputs: Inputs, folder: Path, progress: Any) -> StageResult:
     calls.append("ingest")
     write_json(
         folder / "number.json", config.number // 10
@@ -37,12 +38,12 @@ def _run_ingest(config: IngestConfig, inputs: dict[str, Path], folder: Path, pro
     return StageResult(outputs=("number.json",), line=f"number {config.number}")
 
 
-def _plan_sfm(config: SfmConfig, inputs: dict[str, Path], progress: Progress) -> SfmConfig:
+def _plan_sfm(config: SfmConfig, inputs: Inputs, progress: Progress) -> SfmConfig:
     calls.append("plan sfm")
     return config if config.offset is not None else config.model_copy(update={"offset": 5})
 
 
-def _run_sfm(config: SfmConfig, inputs: dict[str, Path], folder: Path, progress: Any) -> StageResult:
+def _run_sfm(config: SfmConfig, inputs: Inputs, folder: Path, progress: Any) -> StageResult:
     calls.append("sfm")
     if config.fail:
         raise StageError("sfm.fake", "it failed", "it was told to", "Do not tell it to.")
@@ -52,7 +53,7 @@ def _run_sfm(config: SfmConfig, inputs: dict[str, Path], folder: Path, progress:
     return StageResult(outputs=("deep",), records=("log.txt",), line="doubled", facts={"offset": config.offset})
 
 
-def _run_train(config: TrainConfig, inputs: dict[str, Path], folder: Path, progress: Any) -> StageResult:
+def _run_train(config: TrainConfig, inputs: Inputs, folder: Path, progress: Any) -> StageResult:
     calls.append("train")
     checkpoint = folder / "checkpoint.json"
     start = read_json(checkpoint) if checkpoint.exists() else 0
@@ -64,16 +65,42 @@ def _run_train(config: TrainConfig, inputs: dict[str, Path], folder: Path, progr
     return StageResult(outputs=("result.json",), line=f"{config.steps - start} steps taken")
 
 
-def _module(needs: tuple[str, ...], config: type[StageConfig], run: Any, **more: Any) -> SimpleNamespace:
-    defaults = {"VERSION": 1, "RESUMES": False, "PUBLISHED": ()}
-    return SimpleNamespace(INPUTS=needs, Config=config, run=run, **(defaults | more))
-
-
-STAGES = {
-    "ingest": _module((), IngestConfig, _run_ingest),
-    "sfm": _module(("ingest",), SfmConfig, _run_sfm, plan=_plan_sfm, PUBLISHED=("deep", "log.txt")),
-    "train": _module(("sfm",), TrainConfig, _run_train, RESUMES=True, PUBLISHED=("result.json",)),
+STAGES: dict[str, Stage] = {
+    "ingest": Stage(
+        name="ingest",
+        inputs=(),
+        version=1,
+        exit_code=10,
+        published=(),
+        config=IngestConfig,
+        run=_run_ingest,
+    ),
+    "sfm": Stage(
+        name="sfm",
+        inputs=("ingest",),
+        version=1,
+        exit_code=11,
+        published=("deep", "log.txt"),
+        config=SfmConfig,
+        plan=_plan_sfm,
+        run=_run_sfm,
+    ),
+    "train": Stage(
+        name="train",
+        inputs=("sfm",),
+        version=1,
+        exit_code=14,
+        resumes=True,
+        published=("result.json",),
+        config=TrainConfig,
+        run=_run_train,
+    ),
 }
+
+
+def declare(monkeypatch: pytest.MonkeyPatch, stage: str, **declarations: Any) -> None:
+    """Let ``stage`` declare something else."""
+    monkeypatch.setitem(STAGES, stage, replace(STAGES[stage], **declarations))
 
 
 class FakeSettings(BaseModel):

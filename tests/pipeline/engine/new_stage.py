@@ -2,17 +2,9 @@
 
 from pathlib import Path
 
-from stages.contract import Flexible, Inputs, Progress, StageConfig, StageError, StageResult, Workload
+from stages.contract import Flexible, Inputs, Progress, Stage, StageConfig, StageError, StageResult, Workload
 from stages.io.files import write_json
 from stages.io.photos import read_photos
-
-INPUTS = ("ingest",)
-VERSION = 1
-EXIT_CODE = 42
-RESUMES = False
-PUBLISHED = ("count.json",)
-NOT_HASHED = ("seconds",)
-FLEXIBLE = Flexible(share=0.1, min_seconds=1.0)
 
 
 class Config(StageConfig):
@@ -41,3 +33,18 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     count = min(config.most, len(read_photos(inputs["ingest"])))
     write_json(folder / "count.json", count)
     return StageResult(("count.json",), f"{count} photos")
+
+
+STAGE = Stage(
+    name="count",
+    inputs=("ingest",),
+    version=1,
+    exit_code=42,
+    published=("count.json",),
+    config=Config,
+    not_hashed=("seconds",),
+    plan=plan,
+    run=run,
+    expected_seconds=expected_seconds,
+    flexible=Flexible(share=0.1, min_seconds=1.0),
+)

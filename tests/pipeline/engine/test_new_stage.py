@@ -17,7 +17,7 @@ WITH_IT = """
 import sys
 from pipeline.engine import stage_list
 from tests.pipeline.engine import new_stage
-stage_list.STAGES["count"] = new_stage
+stage_list.STAGES["count"] = new_stage.STAGE
 from pipeline.cli.commands import run_command
 sys.exit(run_command(sys.argv[1:]))
 """
@@ -53,7 +53,7 @@ def test_its_errors_have_its_exit_code(workspace: Path):
 
 
 def test_it_has_its_part_of_a_budget():
-    stages = STAGES | {"count": new_stage}
+    stages = STAGES | {"count": new_stage.STAGE}
     alone = allocated_seconds(stages, "count", 60.0, {}, 300.0, 0.0)
     beside = allocated_seconds(stages, "count", 60.0, {"mesh": None}, 300.0, 0.0)
     assert alone == 60.0 and 1.0 < beside < alone

@@ -17,7 +17,7 @@ from pipeline.engine.workspace import Workspace
 from pipeline.schedule.forecast import Forecast
 from stages.io.files import read_json
 from tests.pipeline.engine import fake_stages
-from tests.pipeline.engine.fake_stages import FakeSettings, calls
+from tests.pipeline.engine.fake_stages import FakeSettings, calls, declare
 from tests.pipeline.schedule import made_up_machine
 
 Bring = Callable[..., None]
@@ -42,7 +42,7 @@ def bring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bring:
 
 def test_unhashed_options_change_after_planning(bring: Bring, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a longer --sfm.max-seconds, once a shorter one was not enough."""
-    monkeypatch.setattr(fake_stages.STAGES["sfm"], "NOT_HASHED", ("fail",), raising=False)
+    declare(monkeypatch, "sfm", not_hashed=("fail",))
     with pytest.raises(StageFailed):
         bring(fail=True)
     bring(fail=False)

@@ -4,6 +4,7 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PIL import Image
@@ -14,10 +15,10 @@ from pipeline.engine.failures import StageFailed
 from pipeline.engine.job import NotReady
 from pipeline.engine.runner import Runner
 from pipeline.engine.workspace import Workspace
-from stages.contract import StageError
+from stages.contract import Inputs, StageError, StageResult
 from stages.ingest.sources import find_source
 from tests.pipeline.engine import fake_stages
-from tests.pipeline.engine.fake_stages import FakeSettings, calls
+from tests.pipeline.engine.fake_stages import FakeSettings, calls, declare
 from tests.refusals import refused
 
 ALL = ("ingest", "sfm", "train")
@@ -163,20 +164,26 @@ def test_a_kill_between_manifest_and_rename_loses_nothing(bring: Bring, tmp_path
 
 
 def test_unhashed_options_do_not_run_a_stage_again(bring: Bring, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(fake_stages.STAGES["train"], "NOT_HASHED", ("die_at",), raising=False)
+    declare(monkeypatch, "train", not_hashed=("die_at",))
     bring()
     bring(train={"die_at": 99})
     assert calls == []
 
 
+def given_to_train(monkeypatch: pytest.MonkeyPatch, **declarations: tuple[str, ...]) -> list[set[str]]:
+    """Let train declare these inputs; returns what each run of it is given."""
+    run, given = fake_stages.STAGES["train"].run, list[set[str]]()
+
+    def noted(config: Any, inputs: Inputs, *rest: Any) -> StageResult:
+        given.append({*inputs})
+        return run(config, inputs, *rest)
+
+    declare(monkeypatch, "train", run=noted, **declarations)
+    return given
+
+
 def test_optional_inputs_neither_run_nor_make_stale(bring: Bring, monkeypatch: pytest.MonkeyPatch):
-    train, seen = fake_stages.STAGES["train"], list[set[str]]()
-    whole = train.run
-    monkeypatch.setattr(train, "INPUTS", ("ingest",))
-    monkeypatch.setattr(train, "OPTIONAL_INPUTS", ("sfm",), raising=False)
-    monkeypatch.setattr(
-        train, "run", lambda config, inputs, *rest: seen.append({*inputs}) or whole(config, inputs, *rest)
-    )
+    seen = given_to_train(monkeypatch, inputs=("ingest",), optional_inputs=("sfm",))
     bring(stages=("ingest", "train"))
     bring(stages=("ingest", "sfm"))
     bring(stages=("ingest", "train"))
@@ -186,13 +193,7 @@ def test_optional_inputs_neither_run_nor_make_stale(bring: Bring, monkeypatch: p
 
 
 def test_damaged_optional_inputs_are_left_out_in_place(bring: Bring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    train, seen, notes = fake_stages.STAGES["train"], list[set[str]](), list[str]()
-    whole = train.run
-    monkeypatch.setattr(train, "INPUTS", ("ingest",))
-    monkeypatch.setattr(train, "OPTIONAL_INPUTS", ("sfm",), raising=False)
-    monkeypatch.setattr(
-        train, "run", lambda config, inputs, *rest: seen.append({*inputs}) or whole(config, inputs, *rest)
-    )
+    seen, notes = given_to_train(monkeypatch, inputs=("ingest",), optional_inputs=("sfm",)), list[str]()
     monkeypatch.setattr(SilentDisplay, "note", lambda _, code, message: notes.append(message))
     bring(stages=("ingest", "sfm"))
     (folder,) = (tmp_path / "w.nerf/sfm").iterdir()
@@ -400,14 +401,7 @@ def test_clean_keeps_what_is_used(bring: Bring, tmp_path: Path):
 @pytest.fixture
 def dispensable_sfm(monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
     """Train reads ingest, and sfm where it has a result; returns what each run of it was given."""
-    train, given = fake_stages.STAGES["train"], list[set[str]]()
-    run = train.run
-    monkeypatch.setattr(train, "INPUTS", ("ingest", "sfm"))
-    monkeypatch.setattr(train, "DISPENSABLE", ("sfm",), raising=False)
-    monkeypatch.setattr(
-        train, "run", lambda config, inputs, *rest: given.append({*inputs}) or run(config, inputs, *rest)
-    )
-    return given
+    return given_to_train(monkeypatch, inputs=("ingest", "sfm"), dispensable=("sfm",))
 
 
 def test_a_run_goes_on_without_what_later_stages_can_spare(
@@ -436,7 +430,7 @@ def test_the_first_failure_decides_the_end(
 
     codes: list[str] = []
     monkeypatch.setattr(SilentDisplay, "note", lambda _, code, message: codes.append(code))
-    monkeypatch.setattr(fake_stages.STAGES["train"], "run", fail)
+    declare(monkeypatch, "train", run=fail)
     with pytest.raises(StageFailed) as caught:
         bring(sfm={"fail": True})
     assert caught.value.stage == "sfm" and codes == ["pipeline.goes-on", "pipeline.failed-too"]
@@ -445,10 +439,12 @@ def test_the_first_failure_decides_the_end(
     assert caught.value.stage == "train"
 
 
-def test_a_failure_ends_the_run_of_what_needs_it(bring: Bring, dispensable_sfm: list[set[str]]):
+def test_a_failure_ends_the_run_of_what_needs_it(
+    bring: Bring, dispensable_sfm: list[set[str]], monkeypatch: pytest.MonkeyPatch
+):
     with pytest.raises(StageFailed):
         bring(sfm={"fail": True}, stages=("ingest", "sfm"))
-    fake_stages.STAGES["train"].DISPENSABLE = ()
+    declare(monkeypatch, "train", dispensable=())
     with pytest.raises(StageFailed):
         bring(sfm={"fail": True})
     assert dispensable_sfm == []

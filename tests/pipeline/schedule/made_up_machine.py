@@ -15,7 +15,7 @@ from pipeline.engine.runner import Runner
 from pipeline.engine.stage_list import STAGES
 from pipeline.engine.workspace import RUN_FILE, Workspace
 from pipeline.schedule.budget import Account, allocated_seconds, min_total
-from stages.contract import StageConfig, StageError, StageResult, reading_seconds
+from stages.contract import Stage, StageConfig, StageError, StageResult, reading_seconds
 from stages.hardware.device import processors
 from stages.io.files import write_durably, write_json
 from stages.io.photos import Photo, write_photos
@@ -31,9 +31,8 @@ INPUTS: dict[str, tuple[str, ...]] = {
 INPUTS |= {"evaluate": ("train",), "render": ("train",), "mesh": ("train",), "tradeoff": ("effects",)}
 INPUTS["report"] = ("train", "evaluate", "render", "mesh", "tradeoff")
 
-FLEXIBLE = {name: module.FLEXIBLE for name, module in STAGES.items() if hasattr(module, "FLEXIBLE")}
+FLEXIBLE = {name: flexible for name, stage in STAGES.items() if (flexible := stage.flexible)}
 MIN_SECONDS = {name: flexible.min_seconds for name, flexible in FLEXIBLE.items()}
-ABOUT_TIME = ("FLEXIBLE", "budget_seconds", "limiting_seconds", "ON_REQUEST", "SUMMARY")
 
 
 def allocated(stage: str, left: float, to_come: dict[str, float | None], total: float, reading: float = 0.0) -> float:
@@ -46,8 +45,8 @@ def least(times: dict[str, float | None], reading: float = 0.0) -> float:
     return min_total(STAGES, times, reading)
 
 
-class Stage(StageConfig):
-    """A stage that works for as long as it is told, or as long as it must."""
+class Timed(StageConfig):
+    """Of a stage that works for as long as it is told, or as long as it must."""
 
     photos: Path = Path()
     cameras: Path | None = None
@@ -56,7 +55,7 @@ class Stage(StageConfig):
     pace: float = 1.0
 
 
-class Training(Stage):
+class Training(Timed):
     steps: int | None = None
     preset: str | None = None
     after: str | None = None
@@ -125,11 +124,11 @@ EXPECTED: dict[str, float | None] = dict.fromkeys(FLEXIBLE) | {
 }  # fmt: skip
 
 
-def chain(machine: Machine) -> dict[str, SimpleNamespace]:
+def chain(machine: Machine) -> dict[str, Stage]:
     """Nine stages like the real ones: some take what they take, training has a clock, the rest measure speed."""
 
-    def plan(name: str) -> Callable[..., Stage]:
-        def units(config: Stage, _inputs: object, _progress: object) -> Stage:
+    def plan(name: str) -> Callable[..., Timed]:
+        def units(config: Timed, _inputs: object, _progress: object) -> Timed:
             if name not in UNITS or config.units is not None:
                 return config
             least, most, each = UNITS[name]
@@ -175,28 +174,39 @@ def chain(machine: Machine) -> dict[str, SimpleNamespace]:
 
         return work
 
-    def stage(name: str) -> SimpleNamespace:
-        declared = {one: getattr(STAGES[name], one) for one in ABOUT_TIME if hasattr(STAGES[name], one)}
-        common = declared | {"INPUTS": INPUTS.get(name, ()), "VERSION": 1, "RESUMES": name == "train", "PUBLISHED": ()}
-        if name in ("ingest", "normalise", "report"):
-            return SimpleNamespace(Config=Fixed, run=run(name), **common)
-        unkeyed = () if name == "train" else ("seconds",)
-        config = Training if name == "train" else Stage
-        return SimpleNamespace(Config=config, run=run(name), plan=plan(name), NOT_HASHED=unkeyed, **common)
+    def stage(name: str) -> Stage:
+        real, planned = STAGES[name], name not in ("ingest", "normalise", "report")
+        return Stage(
+            name=name,
+            inputs=INPUTS.get(name, ()),
+            version=1,
+            exit_code=real.exit_code,
+            resumes=name == "train",
+            published=(),
+            config=Training if name == "train" else Timed if planned else Fixed,
+            not_hashed=("seconds",) if planned and name != "train" else (),
+            plan=plan(name) if planned else None,
+            run=run(name),
+            on_request=real.on_request,
+            summary=real.summary,
+            flexible=real.flexible,
+            budget_seconds=real.budget_seconds,
+            limiting_seconds=real.limiting_seconds,
+        )
 
     return {name: stage(name) for name in (*CHAIN[:-1], "tradeoff", "report")}
 
 
 class Options(BaseModel):
     ingest: Fixed = Fixed()
-    sfm: Stage = Stage()
+    sfm: Timed = Timed()
     normalise: Fixed = Fixed()
-    effects: Stage = Stage()
+    effects: Timed = Timed()
     train: Training = Training()
-    evaluate: Stage = Stage()
-    render: Stage = Stage()
-    mesh: Stage = Stage()
-    tradeoff: Stage = Stage(seconds=1000.0)
+    evaluate: Timed = Timed()
+    render: Timed = Timed()
+    mesh: Timed = Timed()
+    tradeoff: Timed = Timed(seconds=1000.0)
     report: Fixed = Fixed()
 
 

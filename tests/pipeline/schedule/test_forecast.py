@@ -133,7 +133,7 @@ def test_a_run_without_a_budget_is_expected_in_minutes(said_of: SaidOf) -> None:
 
 
 def pilots_seconds(given: Settings, times: dict[str, float | None], reading: float) -> float | None:
-    return limited_seconds(STAGES, "effects", {name: getattr(given, name) for name in STAGES}, times, reading)
+    return limited_seconds(STAGES["effects"], {name: getattr(given, name) for name in STAGES}, times, reading)
 
 
 def test_pilots_have_a_limit_where_time_is_known() -> None:
@@ -147,7 +147,7 @@ def test_pilots_have_a_limit_where_time_is_known() -> None:
 
 
 def behind_plan(stage: str, given: Settings, total: float | None) -> dict[str, float]:
-    return time_behind_plan(STAGES, stage, {name: getattr(given, name) for name in STAGES}, total)
+    return time_behind_plan(STAGES[stage], {name: getattr(given, name) for name in STAGES}, total)
 
 
 def test_only_pilots_are_planned_again_with_another_training() -> None:

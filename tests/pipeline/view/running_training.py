@@ -74,7 +74,7 @@ class RunningTraining:
 
     def _train(self) -> None:
         try:
-            config = plan_stage(train, self.config, self.inputs, RecordedProgress())
+            config = plan_stage(train.STAGE, self.config, self.inputs, RecordedProgress())
             loaded = training.load(config, self.inputs, self.partial, RecordedProgress())
             trainer, step = loaded.run.trainer, loaded.run.trainer.step
 

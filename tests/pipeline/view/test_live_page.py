@@ -69,7 +69,7 @@ def test_a_finished_page_notices_another_training(browser: Any, tmp_path: Path) 
         train, out = training.workspace.folder("train", KEYS["train"]), tmp_path / "out"
         out.mkdir()
         config = viewer.Config(bits="8", mesh="off")
-        run_stage(viewer, config, training.inputs | {"train": train}, out, RecordedProgress())
+        run_stage(viewer.STAGE, config, training.inputs | {"train": train}, out, RecordedProgress())
         training.make_page((out / "viewer.html").read_text("utf-8"))
     server = Served(training)
     page = Viewer(browser, server.server.url)

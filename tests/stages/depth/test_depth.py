@@ -163,7 +163,7 @@ def test_two_photos_cannot_agree(tmp_path) -> None:
 def test_photos_from_one_place_are_refused(count: int, tmp_path) -> None:
     poses = np.repeat(cameras_before()[:1], count, axis=0)
     inputs = a_scene(poses).write(tmp_path)
-    assert plan_stage(depth, Config(seconds=10), inputs, RecordedProgress()).downscale == 1
+    assert plan_stage(depth.STAGE, Config(seconds=10), inputs, RecordedProgress()).downscale == 1
     with refused("depth.no-pairs", count):
         result_of(inputs, tmp_path / "out")
 
@@ -198,11 +198,11 @@ def test_large_pairs_are_matched_in_little_memory(inputs, undisturbed, tmp_path,
 def test_a_short_time_makes_smaller_maps(inputs, tmp_path) -> None:
     sides = []
     for seconds in (1e-3, 1e3):
-        planned = plan_stage(depth, Config(seconds=seconds), inputs, RecordedProgress())
+        planned = plan_stage(depth.STAGE, Config(seconds=seconds), inputs, RecordedProgress())
         assert planned.downscale is not None
         sides.append(240 / planned.downscale)
     assert sides == [pytest.approx(160, rel=0.01), 240]
-    assert plan_stage(depth, Config(), inputs, RecordedProgress()).downscale == 1
+    assert plan_stage(depth.STAGE, Config(), inputs, RecordedProgress()).downscale == 1
 
 
 def test_more_photos_and_neighbours_are_expected_to_take_longer() -> None:

@@ -44,9 +44,9 @@ def trained(listed: None, tmp_path: Path) -> dict[str, Path]:
     for name in ("effects", "train", "evaluate", "render"):
         inputs[name].mkdir()
     decide = with_effects(Settings(), ["veil=on", "exposure=on"]).effects.model_copy(update={"pilots": 0})
-    run_stage(effects, decide, inputs, inputs["effects"], SilentDisplay())
+    run_stage(effects.STAGE, decide, inputs, inputs["effects"], SilentDisplay())
     grid = HashGridOptions(num_levels=2, log2_hashmap_size=8, max_res=16, target_samples=512)
-    run_stage(train, train.Config(downscale=8.0, steps=5, grid=grid), inputs, inputs["train"], SilentDisplay())
+    run_stage(train.STAGE, train.Config(downscale=8.0, steps=5, grid=grid), inputs, inputs["train"], SilentDisplay())
     return inputs
 
 
@@ -79,19 +79,23 @@ def test_photos_are_rendered_and_scored_through_a_new_effect(trained: dict[str, 
     _, level = photo_effects(field, scene, test)
     assert 0 < float(level.rows) <= 0.25, "a test photo is veiled as its neighbours are"
     chosen = evaluate.Config(downscale=8.0)
-    run_stage(evaluate, chosen, trained, trained["evaluate"], SilentDisplay())
+    run_stage(evaluate.STAGE, chosen, trained, trained["evaluate"], SilentDisplay())
     metrics = read_json(trained["evaluate"] / "metrics.json")
     assert metrics["appearance"] == [ExposureModel.held_out_words, VeilModel.held_out_words]
     without = {**field, "effects": {"exposure": field["effects"]["exposure"]}}
     file.write_text(json.dumps(without))
     (trained["evaluate"].parent / "plain").mkdir()
-    run_stage(evaluate, chosen, trained, trained["evaluate"].parent / "plain", SilentDisplay())
+    run_stage(evaluate.STAGE, chosen, trained, trained["evaluate"].parent / "plain", SilentDisplay())
     assert read_json(trained["evaluate"].parent / "plain" / "metrics.json")["psnr"] != metrics["psnr"]
 
     file.write_text(json.dumps(field))
     like = scene.of_split("train")[3].name
     rendered = run_stage(
-        render, render.Config(frames=2, width=32, match_exposure=like), trained, trained["render"], SilentDisplay()
+        render.STAGE,
+        render.Config(frames=2, width=32, match_exposure=like),
+        trained,
+        trained["render"],
+        SilentDisplay(),
     )
     assert rendered.facts["appearance"] == f"exposed like {like}"
     as_photo, _ = with_appearance(load_renderer(trained["train"]), like, trained["train"], scene, SilentDisplay())

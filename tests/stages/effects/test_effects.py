@@ -63,7 +63,7 @@ def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
         monkeypatch.setattr(ab_runs, "run_pilot", pilot or run_pilot)
         folder = tmp_path / f"effects{len(list(tmp_path.iterdir()))}"
         folder.mkdir()
-        result = run_stage(effects, config, inputs, folder, SilentDisplay())
+        result = run_stage(effects.STAGE, config, inputs, folder, SilentDisplay())
         table = json.loads((folder / "effects.json").read_text("utf-8"))
         return read_decisions(folder), table, result.line, tried
 
@@ -166,7 +166,7 @@ def test_what_was_asked_for_is_done(decided: Callable, value: effects.Switch) ->
 def training_key(effects_folder: Path) -> str:
     """The key of a training that rests on these decisions."""
     outputs = manifests.describe_outputs(effects_folder, ("decisions.json",))
-    return stage_key("train", train.VERSION, {}, {"effects": manifests.outputs_digest(outputs)})
+    return stage_key("train", train.STAGE.version, {}, {"effects": manifests.outputs_digest(outputs)})
 
 
 @pytest.mark.parametrize("said", [False, None])
@@ -200,7 +200,7 @@ def test_real_evidence_of_a_synthetic_scene(tmp_path: Path, made: Effects, on: s
     inputs = effect_scene(tmp_path / "scene", made)
     folder = tmp_path / "effects"
     folder.mkdir()
-    run_stage(effects, effects.Config(pilot_steps=0), inputs, folder, SilentDisplay())
+    run_stage(effects.STAGE, effects.Config(pilot_steps=0), inputs, folder, SilentDisplay())
     table = json.loads((folder / "effects.json").read_text("utf-8"))
     found = {name for name, entry in table.items() if entry["on"] and entry["modelled"]}
     assert found == on

@@ -95,7 +95,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
         alpha: bool = False,
         scale: int = 1,
     ) -> dict[str, Path]:
-        inputs = {stage: tmp_path / stage for stage in evaluate.INPUTS}
+        inputs = {stage: tmp_path / stage for stage in evaluate.STAGE.inputs}
         for folder in inputs.values():
             folder.mkdir()
         (inputs["ingest"] / "images").mkdir()
@@ -120,7 +120,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
 
 def _run(inputs: dict[str, Path], folder: Path, progress: Any, **settings: Any) -> tuple[dict[str, Any], str]:
     folder.mkdir()
-    result = run_stage(evaluate, evaluate.Config(**settings), inputs, folder, progress)
+    result = run_stage(evaluate.STAGE, evaluate.Config(**settings), inputs, folder, progress)
     return json.loads((folder / "metrics.json").read_text("utf-8")), result.line
 
 
@@ -341,7 +341,7 @@ def codes(metrics: dict[str, Any]) -> list[str]:
 
 def make_again(folder: Path) -> dict[str, Path]:
     """The folders that were made before."""
-    return {stage: folder / stage for stage in evaluate.INPUTS}
+    return {stage: folder / stage for stage in evaluate.STAGE.inputs}
 
 
 def test_what_masks_ignore_does_not_count(make: Make, tmp_path: Path, progress: Any):

@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Literal
 
 import pytest
@@ -13,7 +12,7 @@ import nerf.kernels
 from nerf.kernels import torch as reference
 from nerf.kernels import warp
 from stages import evaluate, mesh, render, train
-from stages.contract import StageConfig, StageError, run_stage
+from stages.contract import Stage, StageConfig, StageError, run_stage
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.io.field_files import load_field
 from stages.io.files import write_json
@@ -131,7 +130,7 @@ def test_both_backends_train_the_same_field_from_photos(tmp_path: Path, progress
     for backend in backends:
         folder = tmp_path / backend
         folder.mkdir()
-        result = run_stage(train, tiny(backend, steps=120), inputs, folder, progress)
+        result = run_stage(train.STAGE, tiny(backend, steps=120), inputs, folder, progress)
         found[backend] = result.facts["probe_psnr"]
         assert load_field(folder)[1]["kind"] == "grid"
     flat = 11.0  # dB, of the best single colour
@@ -139,21 +138,21 @@ def test_both_backends_train_the_same_field_from_photos(tmp_path: Path, progress
     assert found["warp"] == pytest.approx(found["torch"], abs=0.1)
 
 
-LATER: dict[ModuleType, StageConfig] = {
-    evaluate: evaluate.Config(fraction=1),
-    render: render.Config(frames=2, width=16),
-    mesh: mesh.Config(resolution=16),
+LATER: dict[Stage, StageConfig] = {
+    evaluate.STAGE: evaluate.Config(fraction=1),
+    render.STAGE: render.Config(frames=2, width=16),
+    mesh.STAGE: mesh.Config(resolution=16),
 }
 
 
-@pytest.mark.parametrize("stage", LATER, ids=lambda stage: stage.__name__)
-def test_what_torch_trained_stays_with_torch_in_every_stage(stage: ModuleType, tmp_path: Path, progress) -> None:
+@pytest.mark.parametrize("stage", LATER, ids=lambda stage: stage.name)
+def test_what_torch_trained_stays_with_torch_in_every_stage(stage: Stage, tmp_path: Path, progress) -> None:
     inputs, _ = photographed(tmp_path, channels=4)
     for name in ("train", "later", "scale"):
         (tmp_path / name).mkdir()
     write_json(tmp_path / "scale/scale.json", {"metres_per_unit": None})
     inputs = inputs | {"scale": tmp_path / "scale"}
-    run_stage(train, tiny("torch", steps=2), inputs, tmp_path / "train", progress)
+    run_stage(train.STAGE, tiny("torch", steps=2), inputs, tmp_path / "train", progress)
     assert AS_TRAINED not in progress.codes
     with contextlib.suppress(StageError):  # two steps may leave no surface
         run_stage(stage, LATER[stage], inputs | {"train": tmp_path / "train"}, tmp_path / "later", progress)

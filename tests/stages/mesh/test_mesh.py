@@ -100,7 +100,7 @@ def run_mesh(tmp_path, progress, monkeypatch):
         monkeypatch.setattr(module, name, small)
 
     def run(model, folder="mesh", scene=None, points=NO_POINTS, learnt=None, metres=None, **settings):
-        inputs = {name: tmp_path / name for name in mesh.INPUTS}
+        inputs = {name: tmp_path / name for name in mesh.STAGE.inputs}
         for path in (*inputs.values(), tmp_path / folder):
             path.mkdir(exist_ok=True)
         write_json(inputs["normalise"] / "scene.json", (scene or scene_around()).to_json())
@@ -110,7 +110,7 @@ def run_mesh(tmp_path, progress, monkeypatch):
         write_json(inputs["scale"] / "scale.json", {"metres_per_unit": metres})
         monkeypatch.setattr(extraction, "load_field", lambda *_: (model, info))
         config = mesh.Config.model_validate({"resolution": 48, "texture_size": 0, "refine": False} | settings)
-        return run_stage(mesh, config, inputs, tmp_path / folder, progress), tmp_path / folder
+        return run_stage(mesh.STAGE, config, inputs, tmp_path / folder, progress), tmp_path / folder
 
     return run
 

@@ -85,7 +85,7 @@ def given_path(content: dict[str, object], scene: Scene, folder: Path) -> Camera
 
 
 def run(inputs, progress, **config):
-    return run_stage(render, render.Config(**config), inputs, inputs["render"], progress)
+    return run_stage(render.STAGE, render.Config(**config), inputs, inputs["render"], progress)
 
 
 def test_video_and_depth_show_the_field_from_the_path(inputs, progress) -> None:

@@ -41,7 +41,7 @@ def measured(
     **config: Any,
 ) -> dict[str, Any]:
     """scale.json of a run."""
-    inputs = {name: folder / name for name in scale.INPUTS}
+    inputs = {name: folder / name for name in scale.STAGE.inputs}
     places, pictures = photos
     files = [f"{number}.png" for number in range(len(pictures))]
     for file, picture in zip(files, pictures, strict=True):
@@ -51,7 +51,7 @@ def measured(
     write_json(inputs["sfm"] / "registration.json", {"georeference": georeference})
     write_json(inputs["normalise"] / "scene.json", scene_of(places, SCENE_FROM_SFM, files).to_json())
     write_tensors(inputs["normalise"] / "points.safetensors", {"xyz": np.zeros((0, 3), np.float32)})
-    run_stage(scale, scale.Config(**config), inputs, folder / "out", progress)
+    run_stage(scale.STAGE, scale.Config(**config), inputs, folder / "out", progress)
     return read_json(folder / "out/scale.json")
 
 

@@ -108,11 +108,11 @@ def test_a_resumed_run_knows_its_earlier_time(
     with monkeypatch.context() as patched:
         patched.setattr(worker_process, "COMMAND", ["-c", killed])
         with refused("sfm.worker-killed", "SIGKILL", "matching"):
-            run_stage(sfm, SMALL, folders, tmp_path / "sfm", progress)
+            run_stage(sfm.STAGE, SMALL, folders, tmp_path / "sfm", progress)
     total, phases = json.loads((tmp_path / "sfm/strategies" / PHASE_SECONDS).read_text())
     assert phases["default: matching"] > 2 and total > phases["default: matching"] + phases["default: features"]
     monkeypatch.setattr(worker_process, "COMMAND", ["-c", told])
-    run_stage(sfm, SMALL, folders, tmp_path / "sfm", progress)
+    run_stage(sfm.STAGE, SMALL, folders, tmp_path / "sfm", progress)
     log = (tmp_path / "sfm/sfm.log").read_text()
     seconds = json.loads(next(line for line in log.splitlines() if line.startswith("{'features'")).replace("'", '"'))
     assert seconds["features"] >= phases["default: features"]

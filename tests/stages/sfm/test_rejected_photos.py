@@ -25,7 +25,7 @@ def turned(angle: float, panorama: np.ndarray, size: tuple[int, int] = (240, 180
 def refusal(images: dict[str, np.ndarray], folder: Path, progress) -> StageError:
     inputs = ingested(folder / "ingest", images)
     with pytest.raises(StageError) as error:
-        run_stage(sfm, SMALL, inputs, folder / "sfm", progress)
+        run_stage(sfm.STAGE, SMALL, inputs, folder / "sfm", progress)
     assert not (folder / "sfm" / "sparse").exists()
     assert not (folder / "sfm" / "registration.json").exists()
     return error.value
@@ -93,4 +93,4 @@ def test_intrinsics_that_cannot_be_those_of_the_photos_are_refused(
     images = {f"{i}.png": blots(i, *sizes[i % len(sizes)]) for i in range(3)}
     config, inputs = SMALL.model_copy(update=given), ingested(tmp_path / "ingest", images)
     with refused(f"sfm.{code}", named):
-        run_stage(sfm, config, inputs, tmp_path / "sfm", progress)
+        run_stage(sfm.STAGE, config, inputs, tmp_path / "sfm", progress)

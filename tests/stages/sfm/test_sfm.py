@@ -49,7 +49,7 @@ def inputs(synthetic_photos: SyntheticPhotos, tmp_path_factory: pytest.TempPathF
 def reconstructed(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a finished run on the synthetic photos."""
     folder = tmp_path_factory.mktemp("sfm")
-    run_stage(sfm, SMALL, inputs, folder, SilentDisplay())
+    run_stage(sfm.STAGE, SMALL, inputs, folder, SilentDisplay())
     return folder
 
 
@@ -83,7 +83,7 @@ def found_for(photos: Path, folder: Path) -> dict[str, Path]:
     for each in found.values():
         each.mkdir()
     ingest.run(ingest.Config(photos=photos), {}, found["ingest"], SilentDisplay())
-    run_stage(sfm, SMALL, found, found["sfm"], SilentDisplay())
+    run_stage(sfm.STAGE, SMALL, found, found["sfm"], SilentDisplay())
     return found
 
 
@@ -151,7 +151,7 @@ from pathlib import Path
 from stages import sfm
 from stages.contract import run_stage
 from pipeline.engine.display import SilentDisplay
-run_stage(sfm, sfm.Config(max_features=1000), {"ingest": Path(sys.argv[1])}, Path(sys.argv[2]), SilentDisplay())
+run_stage(sfm.STAGE, sfm.Config(max_features=1000), {"ingest": Path(sys.argv[1])}, Path(sys.argv[2]), SilentDisplay())
 """
 
 
@@ -178,7 +178,7 @@ def test_a_killed_run_ends_its_worker_and_resumes_identically(
     parent.kill()
     parent.wait()
     wait_for(lambda: is_gone(child))
-    run_stage(sfm, SMALL, inputs, tmp_path, progress)
+    run_stage(sfm.STAGE, SMALL, inputs, tmp_path, progress)
     assert progress.codes[0] == "sfm.resumes" and progress.names("sfm.resumes", "12 photos")
     assert contents(tmp_path) == contents(reconstructed)
 
@@ -187,7 +187,7 @@ def test_a_damaged_database_is_made_anew(
     inputs: dict[str, Path], reconstructed: Path, tmp_path: Path, progress
 ) -> None:
     (tmp_path / f"matches-{version('pycolmap')}.db").write_bytes(b"SQLite format 3\0 and then nothing of use")
-    run_stage(sfm, SMALL, inputs, tmp_path, progress)
+    run_stage(sfm.STAGE, SMALL, inputs, tmp_path, progress)
     assert progress.codes[0] == "sfm.damaged-matches"
     assert contents(tmp_path) == contents(reconstructed)
 
@@ -211,7 +211,7 @@ def test_however_the_child_ends_it_is_an_error_with_words(
 ) -> None:
     monkeypatch.setattr(worker_process, "COMMAND", ["-c", child])
     with refused(f"sfm.{message[0]}", *message[1:]):
-        run_stage(sfm, sfm.Config(max_seconds=0.5 if "sleep" in child else 60), inputs, tmp_path, progress)
+        run_stage(sfm.STAGE, sfm.Config(max_seconds=0.5 if "sleep" in child else 60), inputs, tmp_path, progress)
     assert (tmp_path / "sfm.log").exists()
 
 
@@ -222,14 +222,14 @@ def test_an_error_of_the_child_arrives_as_it_was(
     code = f"import stages.sfm.worker as c\nc.reconstruct = lambda *_: (_ for _ in ()).throw(c.{lost})\nc.main()"
     monkeypatch.setattr(worker_process, "COMMAND", ["-c", code])
     with refused("hardware.cluster-lost", "gone", "silent", "Resume."):
-        run_stage(sfm, SMALL, inputs, tmp_path / "sfm", progress)
+        run_stage(sfm.STAGE, SMALL, inputs, tmp_path / "sfm", progress)
 
 
 def test_strangers_are_named_alpha_and_mixed_sizes_work(inputs: dict[str, Path], tmp_path: Path, progress) -> None:
     images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:8]}
     alpha = {f"{n}.png": np.dstack([i, np.full(i.shape[:2], 255, np.uint8)]) for n, i in list(images.items())[:6]}
     plain = dict(list(images.items())[6:]) | {"stranger.png": blots(1, 300, 200)}
-    result = run_stage(sfm, SMALL, ingested(tmp_path / "ingest", alpha | plain), tmp_path / "sfm", progress)
+    result = run_stage(sfm.STAGE, SMALL, ingested(tmp_path / "ingest", alpha | plain), tmp_path / "sfm", progress)
     assert result.line.startswith("8/9 registered, ")
     assert [code.removeprefix("sfm.") for code in progress.codes if code != "sfm.camera-model"] == [
         "matching-time",
@@ -268,7 +268,7 @@ def test_near_duplicates_are_unmatched_and_masks_exclude_features(
     photos[5] = replace(photos[5], mask="masks/m.png")
     write_png(tmp_path / "ingest/masks/m.png", mask)
     write_photos(tmp_path / "ingest", photos, [], {})
-    result = run_stage(sfm, SMALL, {"ingest": tmp_path / "ingest"}, tmp_path / "sfm", progress)
+    result = run_stage(sfm.STAGE, SMALL, {"ingest": tmp_path / "ingest"}, tmp_path / "sfm", progress)
     account = read_json(tmp_path / "sfm/registration.json")
     model = read_model(tmp_path / "sfm/sparse")
     assert result.line.startswith("8/9 registered, ")
@@ -298,7 +298,7 @@ def test_a_known_camera_is_kept(
 ) -> None:
     lens = synthetic_photos.truth.camera
     config = SMALL.model_copy(update={"camera_model": lens.model, "camera_params": lens.params})
-    result = run_stage(sfm, config, inputs, tmp_path, progress)
+    result = run_stage(sfm.STAGE, config, inputs, tmp_path, progress)
     assert result.line.startswith("12/12 registered, ") and " · OPENCV · " in result.line
     assert read_model(tmp_path / "sparse").cameras == [lens]
     assert "sfm.camera-kept" in progress.codes
@@ -318,7 +318,7 @@ def test_photos_with_gps_tell_metres_and_directions(
         for x, y, z in [centres[photo.name]]
     ]
     write_photos(ingest_folder, photos, [], {})
-    run_stage(sfm, SMALL, {"ingest": ingest_folder}, tmp_path / "sfm", progress)
+    run_stage(sfm.STAGE, SMALL, {"ingest": ingest_folder}, tmp_path / "sfm", progress)
     found = read_json(tmp_path / "sfm/registration.json")["georeference"]
     assert found["photos"] == 12 and 0 < found["error_m"] < 0.5
     images = read_model(tmp_path / "sfm/sparse").images
@@ -342,7 +342,7 @@ def test_one_degenerate_camera_does_not_end_the_run(
         "c.main()"
     )
     monkeypatch.setattr(worker_process, "COMMAND", ["-c", child])
-    run_stage(sfm, SMALL, ingested(tmp_path / "ingest", images), tmp_path / "sfm", progress)
+    run_stage(sfm.STAGE, SMALL, ingested(tmp_path / "ingest", images), tmp_path / "sfm", progress)
     assert progress.names("sfm.camera-replaced", "1 photo", "it is wrong", "SIMPLE_PINHOLE")
     account, model = read_json(tmp_path / "sfm/registration.json"), read_model(tmp_path / "sfm/sparse")
     reasons = {image["file"]: image["reason_code"] for image in account["images"] if not image["registered"]}
@@ -387,9 +387,9 @@ def test_a_strategy_that_ended_the_worker_is_skipped(
     with monkeypatch.context() as patched:
         patched.setattr(worker_process, "COMMAND", ["-c", crash])
         with refused(f"sfm.{message[0]}", *message[1:], "'missing photos'"):
-            run_stage(sfm, SMALL, folders, tmp_path / "sfm", progress)
+            run_stage(sfm.STAGE, SMALL, folders, tmp_path / "sfm", progress)
     progress.clear()
-    result = run_stage(sfm, SMALL, folders, tmp_path / "sfm", progress)
+    result = run_stage(sfm.STAGE, SMALL, folders, tmp_path / "sfm", progress)
     assert result.line.startswith("6/7 registered, ")
     assert progress.codes[0] == "sfm.resumes" and progress.names("sfm.resumes", "7 photos", "21 matched pairs")
     assert progress.names("sfm.strategy-failed-before", became, "registering them in the model")
@@ -412,7 +412,7 @@ def test_a_strategy_for_which_no_time_is_left_is_skipped(
     )
     monkeypatch.setattr(worker_process, "COMMAND", ["-c", slow])
     config = SMALL.model_copy(update={"max_seconds": 240.0})
-    result = run_stage(sfm, config, with_a_stranger(inputs, tmp_path / "ingest"), tmp_path / "sfm", progress)
+    result = run_stage(sfm.STAGE, config, with_a_stranger(inputs, tmp_path / "ingest"), tmp_path / "sfm", progress)
     assert result.line.startswith("6/7 registered, ")
     assert result.line.endswith(" · 1 retry strategy skipped for time: sfm --force")
     # Of the first time's 100 s of mapping 0.4, of those of matching 4 / 7; twice 100 s are for the adjustment.
@@ -427,12 +427,12 @@ def test_outcomes_whose_matches_are_gone_are_removed(
     inputs: dict[str, Path], reconstructed: Path, tmp_path: Path, progress
 ) -> None:
     StrategyLog(tmp_path / "strategies").add(Outcome("default", "matches-0.db", [["photo_000.jpg"] * 12], 500, 0.1))
-    run_stage(sfm, SMALL, inputs, tmp_path, progress)
+    run_stage(sfm.STAGE, SMALL, inputs, tmp_path, progress)
     assert contents(tmp_path) == contents(reconstructed)
 
 
 def test_the_screen_never_stands_still(inputs: dict[str, Path], tmp_path: Path, progress) -> None:
-    run_stage(sfm, SMALL, inputs, tmp_path, progress)
+    run_stage(sfm.STAGE, SMALL, inputs, tmp_path, progress)
     shares = [done for _, done in progress.updates if done is not None]
     assert shares == sorted(shares)
     assert 0 <= shares[0] < shares[-1] <= 1
@@ -444,7 +444,7 @@ def test_known_cameras_go_through_without_points(tmp_path: Path, progress) -> No
     config = ingest.Config(photos=tmp_path / "blender")
     ingest.run(config, {}, tmp_path / "ingest", progress)
     result = run_stage(
-        sfm, sfm.Config(cameras=tmp_path / "blender"), {"ingest": tmp_path / "ingest"}, tmp_path / "sfm", progress
+        sfm.STAGE, sfm.Config(cameras=tmp_path / "blender"), {"ingest": tmp_path / "ingest"}, tmp_path / "sfm", progress
     )
     account = read_json(tmp_path / "sfm/registration.json")
     assert result.line == "5/5 poses imported · PINHOLE"
@@ -457,7 +457,7 @@ def test_known_cameras_go_through_without_points(tmp_path: Path, progress) -> No
 
 def test_photos_that_look_alike_are_enough(inputs: dict[str, Path], tmp_path: Path, progress) -> None:
     config = sfm.Config(max_features=1000, matcher="retrieval", neighbours=3)
-    result = run_stage(sfm, config, inputs, tmp_path, progress)
+    result = run_stage(sfm.STAGE, config, inputs, tmp_path, progress)
     assert result.line.startswith("12/12 registered")
     graph = read_json(tmp_path / "registration.json")["match_graph"]
     assert 12 * 3 / 2 <= graph["verified"] <= graph["tried"] < 12 * 11 / 2

@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import psutil
@@ -14,7 +14,7 @@ from PIL import Image
 
 from nerf.geometry.scene import Camera
 from stages import tradeoff, train
-from stages.contract import StageError, StageResult, run_stage
+from stages.contract import Stage, StageError, StageResult, run_stage
 from stages.effects.decisions import Decisions, write_decisions
 from stages.evaluate.tiles import MIN_TILES
 from stages.io import stopwatch
@@ -236,7 +236,7 @@ def test_the_workspaces_field_is_a_point_without_output(
 ) -> None:
     own = tmp_path / "train" / "0123456789abcdef"
     own.mkdir(parents=True)
-    facts = run_stage(train, train.Config(steps=20, downscale=1.0, grid=TINY_GRID), photos, own, progress).facts
+    facts = run_stage(train.STAGE, train.Config(steps=20, downscale=1.0, grid=TINY_GRID), photos, own, progress).facts
     write_json(own / "manifest.json", {"facts": facts})
     with_own = studied(tmp_path / "own", photos | {"train": own}, progress)
     folder, without = whole
@@ -257,7 +257,7 @@ def test_the_workspaces_slow_field_is_scored_on_some_pixels(
 ) -> None:
     own, kind = tmp_path / "train" / "0123456789abcdef", VanillaOptions(**TINY["vanilla"])
     own.mkdir(parents=True)
-    facts = run_stage(train, train.Config(steps=20, downscale=1.0, vanilla=kind), photos, own, progress).facts
+    facts = run_stage(train.STAGE, train.Config(steps=20, downscale=1.0, vanilla=kind), photos, own, progress).facts
     write_json(own / "manifest.json", {"facts": facts})
     crops = benchmark.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
     assert 0 < benchmark.rendering_seconds(own, crops) < 10
@@ -278,7 +278,7 @@ def test_the_workspaces_slow_field_is_scored_on_some_pixels(
 
 def test_a_slow_field_is_scored_on_the_same_crops(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
     scene = read_scene(photos["normalise"])
-    run_stage(train, train.Config(steps=20, downscale=1.0, grid=TINY_GRID), photos, tmp_path, progress)
+    run_stage(train.STAGE, train.Config(steps=20, downscale=1.0, grid=TINY_GRID), photos, tmp_path, progress)
     crops = benchmark.make_benchmark(photos["ingest"], scene, 1.0, 4, 1.0)
     whole, thinned = (benchmark.score(tmp_path, crops, progress, stride) for stride in (1, 4))
     assert whole["ssim"] is not None and thinned["ssim"] is None
@@ -288,7 +288,7 @@ def test_a_slow_field_is_scored_on_the_same_crops(tmp_path: Path, photos: dict[s
 def test_fields_are_scored_over_the_photos_background(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
     white, black = tmp_path / "white", tmp_path / "black"
     white.mkdir()
-    run_stage(train, train.Config(steps=20, downscale=1.0, grid=TINY_GRID), photos, white, progress)
+    run_stage(train.STAGE, train.Config(steps=20, downscale=1.0, grid=TINY_GRID), photos, white, progress)
     shutil.copytree(white, black)
     field = read_json(white / "field.json")
     write_json(black / "field.json", field | {"background": [0.0, 0.0, 0.0]})
@@ -303,7 +303,7 @@ def test_a_run_that_does_not_learn_is_told(
 ) -> None:
     whole = run_stage
 
-    def diverges(stage: ModuleType, config: train.Config, *rest: Any) -> Any:
+    def diverges(stage: Stage, config: train.Config, *rest: Any) -> Any:
         if not config.vanilla.positional_encoding:
             raise StageError("train.diverged", "training diverged", "it was told to", "Do not tell it to.")
         return whole(stage, config, *rest)
@@ -325,7 +325,7 @@ def test_lack_of_memory_ends_and_resumes_the_study(
 ) -> None:
     whole, asked = run_stage, list[int]()
 
-    def short_of_memory(stage: ModuleType, config: train.Config, *rest: Any) -> Any:
+    def short_of_memory(stage: Stage, config: train.Config, *rest: Any) -> Any:
         asked.append(config.steps or 0)
         if len(asked) == 2:
             raise StageError(

@@ -57,7 +57,7 @@ def inputs(tmp_path: Path) -> dict[str, Path]:
 def trained(kind: str, inputs: dict[str, Path], folder: Path, progress: Any, **settings: Any) -> StageResult:
     folder.mkdir(exist_ok=True)
     config: dict[str, Any] = {"downscale": 1.0} | KINDS[kind] | settings
-    return run_stage(train, train.Config(**config), inputs, folder, progress)
+    return run_stage(train.STAGE, train.Config(**config), inputs, folder, progress)
 
 
 def seen(folder: Path, inputs: dict[str, Path], progress: Any) -> tuple[float, float]:

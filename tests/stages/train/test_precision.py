@@ -99,7 +99,7 @@ def test_it_is_set_while_training_alone_and_recorded(matmul, tmp_path: Path, her
     inputs, _ = photographed(tmp_path)
     here(FAST)
     (tmp_path / "train").mkdir()
-    result = run_stage(train, Config(**TINY, steps=2, matmul=matmul), inputs, tmp_path / "train", progress)
+    result = run_stage(train.STAGE, Config(**TINY, steps=2, matmul=matmul), inputs, tmp_path / "train", progress)
     assert trained_at == [matmul] * 2 and torch.get_float32_matmul_precision() == "highest"
     facts = {"matmul": matmul, "medium_matmul_speedup": 2.53, "medium_matmul_error": 1.2e-5}
     assert facts.items() <= result.facts.items()
@@ -118,6 +118,6 @@ def test_products_that_are_inexact_on_another_machine_are_said(tmp_path: Path, h
     here(INEXACT)
     for matmul in ("medium", "highest"):
         (tmp_path / matmul).mkdir()
-        run_stage(train, Config(**TINY, steps=1, matmul=matmul), inputs, tmp_path / matmul, progress)
+        run_stage(train.STAGE, Config(**TINY, steps=1, matmul=matmul), inputs, tmp_path / matmul, progress)
     assert progress.codes.count("train.matmul-inexact") == 1
     assert progress.names("train.matmul-inexact", "3e-04", "--train.matmul highest")

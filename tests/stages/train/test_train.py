@@ -60,7 +60,7 @@ def tiny(field: FieldName = "vanilla", **settings: Any) -> Config:
 
 def trained(folder: Path, inputs: dict[str, Path], progress, field: FieldName = "vanilla", **settings):
     folder.mkdir(exist_ok=True)
-    return run_stage(train, tiny(field, **settings), inputs, folder, progress)
+    return run_stage(train.STAGE, tiny(field, **settings), inputs, folder, progress)
 
 
 def test_photos_become_a_field_that_beats_a_flat_colour(tmp_path: Path, progress) -> None:

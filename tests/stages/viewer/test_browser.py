@@ -39,7 +39,7 @@ def written(folder: Path, space: str, config: viewer.Config | None = None, **inf
     renamed(field)
     out = folder / "viewer"
     out.mkdir()
-    run_stage(viewer, config or viewer.Config(bits="8"), field.inputs, out, RecordedProgress())
+    run_stage(viewer.STAGE, config or viewer.Config(bits="8"), field.inputs, out, RecordedProgress())
     return field, out / "viewer.html"
 
 
@@ -74,7 +74,7 @@ def test_16_bits_colours_without_directions_and_effects(browser: Any, tmp_path: 
     names = [f"{index}.png" for index in range(8)]
     field = made(tmp_path, "contraction", view_dependence=False, effects=gains(names))
     (tmp_path / "viewer").mkdir()
-    run_stage(viewer, viewer.Config(bits="16"), field.inputs, tmp_path / "viewer", RecordedProgress())
+    run_stage(viewer.STAGE, viewer.Config(bits="16"), field.inputs, tmp_path / "viewer", RecordedProgress())
     page, view = Viewer(browser, tmp_path / "viewer/viewer.html"), field.scene.views[3]
     packed = with_table(field.field, quantised(field.field.layout, field.field.table, 16))
     info = read_json(field.inputs["train"] / "field.json")
@@ -93,7 +93,7 @@ def test_the_exposure_slider_makes_a_stop_more_light(browser: Any, tmp_path: Pat
     effects = {"exposure": gains([f"{index}.png" for index in range(8)])["exposure"]}
     field = made(tmp_path, "contraction", effects=effects)
     (tmp_path / "viewer").mkdir()
-    run_stage(viewer, viewer.Config(bits="8"), field.inputs, tmp_path / "viewer", RecordedProgress())
+    run_stage(viewer.STAGE, viewer.Config(bits="8"), field.inputs, tmp_path / "viewer", RecordedProgress())
     page = Viewer(browser, tmp_path / "viewer/viewer.html", 60, 45)
     before = page.shown().reshape(-1, 4)[:, :3] / 255
     page.run("() => { const e = byId('exposure'); e.value = 1; e.dispatchEvent(new Event('input')); }")
@@ -165,8 +165,10 @@ def test_a_photo_beside_its_render_scores_as_in_python(browser: Any, tmp_path: P
         inputs[name] = tmp_path / name
     write_json(inputs["scale"] / "scale.json", {"metres_per_unit": None})
     grid: Any = {"num_levels": 3, "log2_hashmap_size": 12, "max_res": 32, "target_samples": 2048}
-    run_stage(train, train.Config(steps=150, downscale=1.0, grid=grid), inputs, inputs["train"], RecordedProgress())
-    run_stage(viewer, viewer.Config(), inputs, inputs["viewer"], RecordedProgress())
+    run_stage(
+        train.STAGE, train.Config(steps=150, downscale=1.0, grid=grid), inputs, inputs["train"], RecordedProgress()
+    )
+    run_stage(viewer.STAGE, viewer.Config(), inputs, inputs["viewer"], RecordedProgress())
     field, info = load_field(inputs["train"])
     page, index = Viewer(browser, inputs["viewer"] / "viewer.html", WIDTH, HEIGHT), 0
     ball, view = ball_photo(4) / 255, scene.views[index]
@@ -332,7 +334,7 @@ def test_measured_lengths_are_right_to_1_percent(browser: Any, tmp_path: Path):
     write_json(field.inputs["scale"] / "scale.json", {"metres_per_unit": 0.25})
     save_field(field.inputs["train"], solid_cube(), {"background": [1.0] * 3, "downscale": 1.0, "effects": {}})
     (tmp_path / "viewer").mkdir()
-    run_stage(viewer, viewer.Config(bits="8", mesh="off"), field.inputs, tmp_path / "viewer", RecordedProgress())
+    run_stage(viewer.STAGE, viewer.Config(bits="8", mesh="off"), field.inputs, tmp_path / "viewer", RecordedProgress())
     page = Viewer(browser, tmp_path / "viewer/viewer.html", 320, 240)
     page.run("document.querySelector('#measure > summary').click()")
     pose = page.run("viewer.navigation.pose")

@@ -40,7 +40,7 @@ def table() -> torch.Tensor:
 def page_of(field: Made, folder: Path, **config: Any) -> tuple[str, dict[str, Any], dict[str, bytes]]:
     """The HTML, and what is packed in it: header and sections."""
     folder.mkdir()
-    run_stage(viewer, viewer.Config(**config), field.inputs, folder, RecordedProgress())
+    run_stage(viewer.STAGE, viewer.Config(**config), field.inputs, folder, RecordedProgress())
     text = (folder / "viewer.html").read_text("utf-8")
     packed = re.findall(r'type="application/octet-stream">([^<]*)<', text)
     whole = gzip.decompress(base64.b64decode(packed[0]))
@@ -121,7 +121,7 @@ def test_the_mesh_is_in_the_file_unless_told_otherwise(tmp_path: Path):
     assert header["mesh"] == {"middle": [0.0, 0.0, 0.1], "radius": pytest.approx(0.4), "faces": 8}
     assert [len(parts[f"mesh_{name}"]) for name in ("positions", "faces", "colours")] == [36, 48, 18]
     assert viewer.more_inputs(viewer.Config()) == ("mesh",) and viewer.more_inputs(viewer.Config(mesh="off")) == ()
-    assert viewer.DISPENSABLE == ("mesh",), "a mesh that fails leaves a page without one"
+    assert viewer.STAGE.dispensable == ("mesh",), "a mesh that fails leaves a page without one"
     del field.inputs["mesh"]
     _, header, parts = page_of(field, tmp_path / "without")
     assert header["mesh"] is None and not any(name.startswith("mesh") for name in parts)
@@ -148,7 +148,7 @@ def test_a_vanilla_nerf_has_a_page_that_says_why_not(tmp_path: Path):
     model = VanillaNerf(VanillaSettings(depth=2, width=16), seed=0)
     save_field(field.inputs["train"], model, {"background": [1.0, 1.0, 1.0], "downscale": 1.0, "effects": {}})
     (tmp_path / "page").mkdir()
-    result = run_stage(viewer, viewer.Config(), field.inputs, tmp_path / "page", progress)
+    result = run_stage(viewer.STAGE, viewer.Config(), field.inputs, tmp_path / "page", progress)
     text = (tmp_path / "page/viewer.html").read_text("utf-8")
     assert progress.codes == ["viewer.not-rendered"] and result.facts == {"drawn": False}
     assert "vanilla NeRF" in text and "<script" not in text

@@ -54,7 +54,7 @@ def imported(
     cameras.write_text(json.dumps(intrinsics(photos.truth.camera) | {"frames": frames} | split))
     ingest.run(ingest.Config(photos=photos.folder, cameras=cameras), {}, folder / "ingest", progress)
     inputs = {"ingest": folder / "ingest"}
-    run_stage(sfm, sfm.Config(cameras=cameras, **options), inputs, folder / "sfm", progress)
+    run_stage(sfm.STAGE, sfm.Config(cameras=cameras, **options), inputs, folder / "sfm", progress)
     account = read_json(folder / "sfm/registration.json")["images"]
     by_stem = {Path(image["file"]).stem: image for image in account}
     return Import(read_model(folder / "sfm/sparse"), by_stem, progress.codes)

@@ -95,7 +95,7 @@ def frames_of(names: list[str]) -> list[dict[str, Any]]:
 def imported(cameras: Path, photos: Path, folder: Path, progress: Any) -> tuple[SparseModel, np.ndarray]:
     """The cameras as stage sfm leaves them, and the first photo's pixels as ingest does."""
     ingest.run(ingest.Config(photos=photos, cameras=cameras), {}, folder / "ingest", progress)
-    run_stage(sfm, sfm.Config(cameras=cameras), {"ingest": folder / "ingest"}, folder / "sfm", progress)
+    run_stage(sfm.STAGE, sfm.Config(cameras=cameras), {"ingest": folder / "ingest"}, folder / "sfm", progress)
     first = read_photos(folder / "ingest")[0]
     return read_model(folder / "sfm/sparse"), load_pixels(folder / "ingest" / first.file, first.width, first.height)
 
