@@ -1,5 +1,6 @@
 """A study from plan to recommendation: choose its runs, train and score them one by one, write what was found."""
 
+import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from stages.contract import Inputs, Progress, SilentProgress, StageError, StageR
 from stages.effects.decisions import read_decisions
 from stages.evaluate.tiles import MIN_TILES, TILE_SIZE
 from stages.hardware.cluster import fan_out
-from stages.io.amounts import duration, resolution_name
+from stages.io.amounts import duration, duration_option, resolution_name
 from stages.io.files import read_scene, write_json
 from stages.io.stopwatch import counting
 from stages.tradeoff import plots
@@ -32,6 +33,7 @@ from stages.tradeoff.benchmark import (
 from stages.tradeoff.pareto_front import points_of, recommend, table, workspace_point
 from stages.tradeoff.schedule import (
     ABLATIONS,
+    MIN_STEPS,
     REDUCED,
     SCORING_STRIDE,
     SMALL_SIDE,
@@ -88,14 +90,16 @@ def plan_study(config: "Config", inputs: Inputs, progress: Progress) -> "Config"
     rendering = min(rendered_rays_per_second(name, speeds[name]) for name in quick)
     affordable = int(SCORING_TIME * config.seconds * rendering / TILE_SIZE**2)
     reading = measure_reading(scene, inputs["ingest"])
-    chosen = {
+    chosen: dict[str, Any] = {
         "speeds": {name: (round(speed.steps, 4), round(speed.rays, 2)) for name, speed in speeds.items()},
         "space": chosen_space(read_decisions(inputs["effects"]), scene)[0],
         "sizes": sizes,
         "tiles": max(min(affordable, MAX_TILES), MIN_TILES * len(scene.of_split("test"))),
         "reading": (round(reading.photos, 5), round(reading.scored, 5)),
     }
-    return config.model_copy(update=chosen)
+    planned = config.model_copy(update=chosen)
+    schedule_of(planned)  # too little time is said before the choice is kept: the next attempt measures anew
+    return planned
 
 
 def _scene_with_test_photos(inputs: Inputs) -> Scene:
@@ -108,13 +112,35 @@ def _scene_with_test_photos(inputs: Inputs) -> Scene:
 
 
 def schedule_of(config: "Config") -> Schedule:
-    """The runs of a planned study."""
+    """The runs of a planned study.
+
+    Raises:
+        StageError: where the time does not allow a single one, with the time that allows two settings.
+    """
+    schedule = _schedule(config, config.seconds)
+    if not schedule.runs:
+        why = f"no field can be trained for {MIN_STEPS} steps and scored in {duration(config.seconds)} here"
+        enough = f"--budget {duration_option(_enough_seconds(config))}"
+        hint = f"Give at least about {enough}, which compares two settings; more time compares more."
+        raise StageError("tradeoff.too-little-time", "too little time for a study", why, hint)
+    return schedule
+
+
+def _enough_seconds(config: "Config") -> int:
+    """The time that allows two settings, as round as a user would give it."""
+    seconds = 0
+    while len({(run.variant, run.downscale, run.steps) for run in _schedule(config, seconds).runs}) < 2:
+        step = 10 if seconds < 600 else 60
+        seconds = step * math.ceil(max(config.seconds, 1.1 * seconds) / step)
+    return seconds
+
+
+def _schedule(config: "Config", seconds: float) -> Schedule:
+    """The runs of a planned study if it had so many ``seconds``."""
     assert config.speeds and config.space and config.sizes and config.tiles, "plan() chooses them"
     speeds = {name: Speed(*speed) for name, speed in config.speeds.items()}
     rays = config.tiles * TILE_SIZE**2 + NUM_SHOWN * SMALL_SIDE**2
-    return make_schedule(
-        config.seconds, config.seeds, config.space, config.sizes, speeds, rays, ReadingTime(*config.reading)
-    )
+    return make_schedule(seconds, config.seeds, config.space, config.sizes, speeds, rays, ReadingTime(*config.reading))
 
 
 def schedule_lines(schedule: Schedule, seconds: float, runs: Path) -> list[str]:
@@ -148,8 +174,8 @@ def run_study(config: "Config", inputs: Inputs, folder: Path, progress: Progress
     """Make and score the runs of a planned study, and score the workspace's field on the same tiles.
 
     Raises:
-        StageError: without test photos, where not one run could be scored, or where one could not be trained for
-            want of memory or disk.
+        StageError: without test photos, without time for a run, where every run failed, or where one could not be
+            trained for want of memory or disk.
     """
     schedule, runs = schedule_of(config), folder / "runs"
     for line in schedule_lines(schedule, config.seconds, runs):
@@ -180,13 +206,11 @@ def run_study(config: "Config", inputs: Inputs, folder: Path, progress: Progress
         if late:
             why = "this machine is slower than when it was measured" if slowness > 1 else "no time is left"
             progress.note("tradeoff.not-trained", f"{why}; not trained: {'; '.join(list_runs(late))}")
+        failed = [f"{run.label} ({figures['failed']})" for run, figures in results if figures["failed"]]
+        if len(failed) == len(results):
+            why = "; ".join(dict.fromkeys(str(figures["failed"]) for _, figures in results))
+            raise StageError("tradeoff.no-result", "the study has no result", why, "Correct what stopped the runs.")
         existing = score_workspace_field(benchmark, inputs, runs, config.seconds, progress)
-    failed = [f"{run.label} ({figures['failed']})" for run, figures in results if figures["failed"]]
-    if len(failed) == len(results):
-        why = "; ".join(dict.fromkeys(str(figures["failed"]) for _, figures in results))
-        why = why or f"even {schedule.left_out[0]} takes longer than {duration(config.seconds)} here"
-        hint = "Correct what stopped the runs; if time ran out, give more, e.g. --budget 30m."
-        raise StageError("tradeoff.no-result", "the study has no result", why, hint)
     return Outcome(results, (*schedule.left_out, *list_runs(late), *failed), existing, benchmark)
 
 

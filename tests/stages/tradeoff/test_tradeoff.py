@@ -360,9 +360,18 @@ def test_without_held_out_photos_there_is_no_study(tmp_path: Path, photos: dict[
         tradeoff.plan(Config(), inputs, progress)
 
 
-def test_too_little_time_is_said_with_numbers(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
-    with refused("tradeoff.no-result", "2 s", "grid at full resolution", "4, 2, 1"):
-        studied(tmp_path, photos, progress, seconds=2.0)
+def test_too_little_time_is_said_with_what_suffices(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
+    """Also where the workspace has a field of its own, which alone is no study."""
+    shutil.copytree(photos["effects"], trained := tmp_path / "train" / "key")
+    with refused("tradeoff.too-little-time", "2 s", "--budget 10s"):
+        studied(tmp_path / "study", photos | {"train": trained}, progress, seconds=2.0)
+    planned = Config.model_validate(CONFIG | {"speeds": SPEEDS, "seconds": 10.0})
+    assert len({run.steps for run in study.schedule_of(planned).runs}) >= 2
+
+
+def test_too_little_time_is_said_before_a_plan_is_kept(photos: dict[str, Path], progress: Any) -> None:
+    with refused("tradeoff.too-little-time", "0.1 s"):
+        tradeoff.plan(Config(seconds=0.1), photos, progress)
 
 
 def test_tiles_are_parts_of_all_test_photos(photos: dict[str, Path]) -> None:
