@@ -11,7 +11,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict
 
 from stages.contract import BudgetLeft, Flexible, Stage
-from stages.io.amounts import duration
+from stages.io.amounts import duration, least_duration
 from stages.io.stopwatch import elapsed
 
 RUNNING = ".alive"  # in the workspace: what the running stage has cost so far (stages/io/stopwatch.py)
@@ -122,7 +122,7 @@ class Account(BaseModel):
         if least <= self.left:
             return None
         left = f"{duration(max(0.0, self.left))} of {duration(self.total)} are left"
-        return f"{left}, and the remaining stages need at least about {duration(least)}"
+        return f"{left}, and the remaining stages need at least about {least_duration(least)}"
 
     def end(self, stage: str, seconds: float) -> None:
         """Note that an attempt at ``stage`` ended, well or not, after ``seconds``."""

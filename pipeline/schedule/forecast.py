@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from pipeline.schedule.budget import Stages, Times, max_total, min_total
 from stages.contract import BudgetLeft, Photos, Stage, StageConfig, StageError, Workload
 from stages.ingest.sources import find_source
-from stages.io.amounts import duration, rough_duration
+from stages.io.amounts import duration, least_duration, rough_duration
 
 if TYPE_CHECKING:
     from stages.ingest import Config as IngestConfig
@@ -111,11 +111,11 @@ def budget_message(stages: Stages, budget: Left, times: Times, reading: float, e
     given = f"budget {duration(total)}" + (f" and {rough_duration(extra)} on top" if extra else "")
     if least > left and left < total:
         needed = (
-            f"it takes at least about {rough_duration(least)}: give a larger --budget, or every stage does its minimum"
+            f"it takes at least about {least_duration(least)}: give a larger --budget, or every stage does its minimum"
         )
         return f"{given}, of which {duration(max(0.0, left))} are left; {needed}"
     if least > left:
-        soonest = f"it takes at least about {rough_duration(least)}"
+        soonest = f"it takes at least about {least_duration(least)}"
         return f"{given}, too short for these photos: {soonest}; every stage does its minimum"
     finish = _clock(min(left, most) + extra)
     # Others have no use for more than a share, and may well be done sooner.

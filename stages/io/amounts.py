@@ -1,5 +1,7 @@
 """Amounts in words: counts, times, bytes."""
 
+import math
+
 GB = 2**30
 
 
@@ -27,6 +29,13 @@ def duration(seconds: float) -> str:
 def rough_duration(seconds: float) -> str:
     """``40 s``, ``7 min``, ``3 h``: a time as one says it beforehand."""
     return duration(max(1, round(seconds)) if seconds < 60 else 60 * round(seconds / 60))
+
+
+def least_duration(seconds: float) -> str:
+    """``36 s``, ``1 min 10 s``, ``12 min``: a time that is needed at least, rounded up. So where it is more than the
+    time there is, words say so, too."""
+    step = 1 if seconds < 60 else 10 if seconds < 600 else 60
+    return duration(step * max(1, math.ceil(seconds / step)))
 
 
 def duration_option(seconds: float) -> str:

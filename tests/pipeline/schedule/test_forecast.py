@@ -281,6 +281,6 @@ def test_small_sets_are_expected_to_take_as_long_as_measured() -> None:
 def test_a_budget_too_short_for_reading_is_said_to_be(said_of: SaidOf) -> None:
     times: dict[str, float | None] = {"train": None, "report": 2.0}
     assert "done at about" in forecast.budget_message(STAGES, Left(60.0, 60.0), times, 1.0)
-    assert "too short for these photos: it takes at least about 1 min" in forecast.budget_message(
+    assert "too short for these photos: it takes at least about 1 min 20 s" in forecast.budget_message(
         STAGES, Left(60.0, 60.0), times, 40.0
     )

@@ -1,6 +1,6 @@
 import pytest
 
-from stages.io.amounts import bytes_in_words, duration, duration_option, rough_duration, short_count
+from stages.io.amounts import bytes_in_words, duration, duration_option, least_duration, rough_duration, short_count
 
 
 @pytest.mark.parametrize(
@@ -35,6 +35,14 @@ def test_durations(seconds: float, words: str):
 )
 def test_times_are_said_roughly(seconds: float, words: str) -> None:
     assert rough_duration(seconds) == words
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0.0, "1 s"), (40.2, "41 s"), (60.0, "1 min"), (60.4, "1 min 10 s"), (700.0, "12 min"), (3601.0, "1 h 1 min")],
+)
+def test_time_needed_is_rounded_up(seconds: float, words: str) -> None:
+    assert least_duration(seconds) == words
 
 
 @pytest.mark.parametrize(
