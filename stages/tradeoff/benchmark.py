@@ -32,7 +32,7 @@ from stages.io.files import read_json, sync_file, write_json_durably, write_png
 from stages.io.photos import spread
 from stages.io.stopwatch import periodically
 from stages.render.renderer import TIMED_SECONDS, load_renderer
-from stages.tradeoff.schedule import SCORING_STRIDE, SMALL_SIDE, WORKSPACE_FIELD, Run, scoring_stride
+from stages.tradeoff.schedule import SCORING_STRIDE, SMALL_SIDE, Run, scoring_stride
 from stages.train.config import BLACK, WHITE
 from stages.train.data import ALL_MASKED, PhotoReader, scaled_size, view_mask, view_rays
 
@@ -289,7 +289,7 @@ def score_workspace_field(
     key, facts = folder_of_field.resolve().name, read_json(folder_of_field / "manifest.json")["facts"]
     file = folder / f"workspace_{key}.json"
     if (found := read_figures(file)) is None:
-        progress.update(f"scoring {WORKSPACE_FIELD}")
+        progress.update("timing its rendering")
         stride = scoring_stride(rendering_seconds(folder_of_field, benchmark), seconds)
         found = {"stride": stride, "figures": score(folder_of_field, benchmark, progress, stride)}
         write_json_durably(file, found)

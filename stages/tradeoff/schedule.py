@@ -359,8 +359,8 @@ def measure_speeds(scene: Scene, inputs: Inputs, seconds: float, progress: Progr
     """
     decisions, speeds = read_decisions(inputs["effects"]), dict[str, Speed]()
     space, _ = chosen_space(decisions, scene)
-    for number, name in enumerate(TIMED):
-        progress.update(f"timing the training of: {name}", number / len(TIMED))
+    for number, name in enumerate(TIMED, 1):  # no share of the work is told: that is of the study, not of its plan
+        progress.update(f"timing training {number} of {len(TIMED)}: {name}")
         config = _planned(name, space, inputs, progress)
         rays_per_step = field_of(config).rays_per_step(config)
         if VARIANTS[name].family == "published":

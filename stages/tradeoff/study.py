@@ -59,6 +59,7 @@ if TYPE_CHECKING:
 
 MAX_TILES = 512  # or as few of each test photo as make a score
 SCORING_TIME = 0.003  # of the study's time: for rendering all tiles once, whatever the field but the published one
+MIN_SLOWNESS = 1.05  # of runs against the time expected of them, to be given as the reason
 MAX_LATE = 0.1  # of the study's time by which it may end late before runs are left out
 
 
@@ -204,13 +205,14 @@ def run_study(config: "Config", inputs: Inputs, folder: Path, progress: Progress
             slowness = sum(r.figures["wall_seconds"] for r in results) / sum(r.run.seconds for r in results)
             progress.note("tradeoff.result", f"{places[result.run]} {_result_line(result)}")
         if late:
-            why = "this machine is slower than when it was measured" if slowness > 1 else "no time is left"
+            why = f"runs took {slowness:.1f} × the time expected" if slowness >= MIN_SLOWNESS else "no time is left"
             progress.note("tradeoff.not-trained", f"{why}; not trained: {'; '.join(list_runs(late))}")
         failed = [f"{run.label} ({figures['failed']})" for run, figures in results if figures["failed"]]
         if len(failed) == len(results):
             why = "; ".join(dict.fromkeys(str(figures["failed"]) for _, figures in results))
             raise StageError("tradeoff.no-result", "the study has no result", why, "Correct what stopped the runs.")
-        existing = score_workspace_field(benchmark, inputs, runs, config.seconds, progress)
+        last = _RunProgress(progress, WORKSPACE_FIELD, spent() / config.seconds)
+        existing = score_workspace_field(benchmark, inputs, runs, config.seconds, last)
     return Outcome(results, (*schedule.left_out, *list_runs(late), *failed), existing, benchmark)
 
 
@@ -247,8 +249,8 @@ def _result_line(result: Result) -> str:
 
 
 class _RunProgress:
-    """A Progress for one run: live lines under its name and the study's share of the time; its notes become live lines,
-    because the study says in one line what came of it."""
+    """A Progress for one run, or the score of the workspace's field: live lines under its name and the study's share of
+    the time; its notes become live lines, because the study says in one line what came of it."""
 
     def __init__(self, progress: Progress, name: str, done: float) -> None:
         self.progress, self.name, self.done = progress, name, min(1.0, done)

@@ -141,6 +141,8 @@ def test_what_is_planned_is_what_is_run(tmp_path: Path, photos: dict[str, Path],
     assert planned.speeds and set(planned.speeds) == set(schedule.TIMED)
     assert all(steps > 0 and rays > steps for steps, rays in planned.speeds.values())
     assert planned.sizes == (1.0, 1.0) and planned.downscale is None
+    shares = {done for message, done in progress.updates if message.startswith("timing training ")}
+    assert shares == {None}, "a share would be one of the plan, and the study begins at 0 after it"
 
 
 @pytest.mark.parametrize("unbounded, space", [(False, "bounded"), (True, "contracted")])
@@ -204,7 +206,7 @@ def test_a_slow_machine_leaves_arms_out_and_names_them(
     assert len(content["left_out"]) > len(
         study.schedule_of(Config.model_validate(CONFIG | {"speeds": SPEEDS})).left_out
     )
-    assert progress.names("tradeoff.not-trained", "slower")
+    assert progress.names("tradeoff.not-trained", "3.0 × the time expected")
 
 
 def test_what_a_killed_attempt_took_is_time_of_the_study(
@@ -238,7 +240,9 @@ def test_the_workspaces_field_is_a_point_without_output(
     own.mkdir(parents=True)
     facts = run_stage(train.STAGE, train.Config(steps=20, downscale=1.0, grid=TINY_GRID), photos, own, progress).facts
     write_json(own / "manifest.json", {"facts": facts})
-    with_own = studied(tmp_path / "own", photos | {"train": own}, progress)
+    with_own = studied(tmp_path / "own", photos | {"train": own}, studying := RecordedProgress())
+    shares = [done for _, done in studying.updates if done is not None]
+    assert len(shares) > 10 and shares == sorted(shares), "the score of that field goes on from the last run"
     folder, without = whole
     assert with_own.outputs == without.outputs
     for name in with_own.outputs:
