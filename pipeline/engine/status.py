@@ -73,9 +73,11 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
 
 def _why_unplanned(runner: Runner, stage: str, last: Manifest) -> str:
     """Why a stage whose inputs are there has not the result it needs, while its open options are not chosen yet."""
-    read = STAGES[stage].inputs_of(runner.options[stage])
+    read, options = STAGES[stage].inputs_of(runner.options[stage]), runner.options[stage]
     inputs = {name: runner.done[name].outputs_digest for name in read if name in runner.done}
-    return "; ".join(_other_inputs(inputs, last)) or "its automatic options are chosen again"
+    given = options.model_dump(mode="json", exclude={*STAGES[stage].not_hashed}, exclude_none=True)
+    changed = [f"{stage}.{change}" for change in _changes(options, given, last.config)]
+    return "; ".join([*changed, *_other_inputs(inputs, last)]) or "its automatic options are chosen again"
 
 
 def _other_inputs(now: dict[str, str], last: Manifest) -> list[str]:
@@ -111,7 +113,10 @@ def explain(workspace: Workspace, runner: Runner, stage: str) -> list[str]:
     lines = [f"{stage}: {status.state}" + (f" · {status.text}" if status.text else "")]
     try:
         job = runner.resolve(stage, may_plan=False)
-    except (NotReady, StageError):
+    except NotReady as waiting:
+        unknown = "its automatic options are chosen" if waiting.upstream == stage else f"{waiting.upstream} has run"
+        return [*lines, f"It would run, unless a finished result has its key, which is known when {unknown}."]
+    except StageError:
         return lines
     last = last_result(workspace, runner, stage)
     if status.state == "cached":

@@ -44,9 +44,9 @@ class Config(StageConfig):
     tiles: Annotated[int | None, Suppress] = Field(
         default=None, description="Tiles of the test photos to score (default: as time allows)."
     )
-    reading: Annotated[tuple[float, float], Suppress] = Field(
-        default=(0.0, 0.0),
-        description="Seconds to read the photos at one size, and the test photos at the scored size.",
+    reading: Annotated[tuple[float, float] | None, Suppress] = Field(
+        default=None,
+        description="Seconds to read the photos at one size, and the test photos to score (default: measured).",
     )
 
 

@@ -138,7 +138,7 @@ def _enough_seconds(config: "Config") -> int:
 
 def _schedule(config: "Config", seconds: float) -> Schedule:
     """The runs of a planned study if it had so many ``seconds``."""
-    assert config.speeds and config.space and config.sizes and config.tiles, "plan() chooses them"
+    assert config.speeds and config.space and config.sizes and config.tiles and config.reading, "plan() chooses them"
     speeds = {name: Speed(*speed) for name, speed in config.speeds.items()}
     rays = config.tiles * TILE_SIZE**2 + NUM_SHOWN * SMALL_SIDE**2
     return make_schedule(seconds, config.seeds, config.space, config.sizes, speeds, rays, ReadingTime(*config.reading))

@@ -12,7 +12,7 @@ from pipeline.cli.commands import run_command
 from pipeline.engine.display import SilentDisplay
 from pipeline.engine.failures import StageFailed
 from pipeline.engine.runner import Runner
-from pipeline.engine.status import status_of
+from pipeline.engine.status import explain, status_of
 from pipeline.engine.workspace import Workspace
 from pipeline.schedule.forecast import Forecast
 from stages.io.files import read_json
@@ -74,10 +74,11 @@ def test_status_explains_stale_stages_without_a_plan(
     bring: Bring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pipeline.engine.status.STAGES", fake_stages.STAGES)
-    bring()
+    bring(offset=7)
     for number, sfm, why in (
-        (1, {"fail": True}, "its automatic options"),
-        (50, {}, "ingest has"),
+        (1, {"fail": True}, "sfm.fail: False → True"),
+        (1, {}, "its automatic options are chosen again"),
+        (50, {"fail": True}, "sfm.fail: False → True; ingest has another result"),
     ):
         given = {"ingest": {"photos": tmp_path / "photos", "number": number}, "sfm": sfm}
         workspace, settings = Workspace(tmp_path / "w.nerf"), FakeSettings.model_validate(given)
@@ -85,7 +86,9 @@ def test_status_explains_stale_stages_without_a_plan(
             Runner(workspace, settings, SilentDisplay()).run(("ingest",))  # type: ignore[arg-type]
         runner = Runner(workspace, settings, SilentDisplay())  # type: ignore[arg-type]
         found = status_of(workspace, runner, "sfm")
-        assert found.state == "stale" and found.text.startswith(why)
+        assert (found.state, found.text) == ("stale", why)
+        assert explain(workspace, runner, "sfm")[1].startswith("It would run, unless a finished result has its key")
+        assert explain(workspace, runner, "train")[1].endswith("known when sfm has run.")
 
 
 def test_a_run_replans_its_stages_and_one_stage_alone_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

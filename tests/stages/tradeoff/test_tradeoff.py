@@ -45,6 +45,7 @@ CONFIG: dict[str, Any] = {
     "downscale": 1.0,
     "sizes": (1.0,),
     "tiles": 3,
+    "reading": (0.0, 0.0),
 }
 
 
@@ -160,6 +161,7 @@ def test_a_study_keeps_the_scenes_space(
     planned = tradeoff.plan(Config(seconds=60.0), photos | {"effects": tmp_path}, progress)
     assert {planned.space} == {run.space for run in study.schedule_of(planned).runs} == {space}
     assert planned.tiles and 2 * MIN_TILES <= planned.tiles <= 512
+    assert planned.reading
     photos_take, windows_take = planned.reading
     assert 0 < photos_take < 5 and 0 < windows_take < 5
     assert Config.model_validate(planned.model_dump(mode="json")) == planned
