@@ -59,21 +59,35 @@ def continued(config: Config, inputs: Inputs) -> Config:
     _same_inputs(manifest["inputs"], inputs)
     before = Config.model_validate(manifest["config"])
     free = {*IGNORED_OPTIONS, "target_psnr"} if before.target_psnr is not None else {*IGNORED_OPTIONS}
-    if (why := next(_changes(config, before, free), None)) is not None:
-        raise StageError("train.other-settings", "cannot continue training with other settings", why, RESTART_HINT)
+    if (change := next(_changes(config, before, free), None)) is not None:
+        name, value, was = change
+        hint = f"Give {_flag(name, was)}. {RESTART_HINT}"  # the other value is remembered
+        why = f"{name} is {value} now and was {was}"
+        raise StageError("train.other-settings", "cannot continue training with other settings", why, hint)
     own = {name: getattr(config, name) for name in (*MORE_OPTIONS, *OWN_OPTIONS)}
     target = {"target_psnr": config.target_psnr or before.target_psnr}
     return Config.model_validate(manifest["config"] | own | target)
 
 
-def _changes(now: Options, before: Options, free: Collection[str] = (), prefix: str = "") -> Iterator[str]:
-    """Every option, except the ``free`` ones, that is given ``now`` and was another ``before``, as a sentence."""
+def _changes(
+    now: Options, before: Options, free: Collection[str] = (), prefix: str = ""
+) -> Iterator[tuple[str, object, object]]:
+    """Every option, except the ``free`` ones, that is given ``now`` and was another ``before``: its name, both
+    values."""
     for name in type(now).model_fields.keys() - {*free}:
         value, was = getattr(now, name), getattr(before, name)
         if isinstance(value, Options):
             yield from _changes(value, was, prefix=f"{name}.")
         elif value is not None and value != was:
-            yield f"{prefix}{name} is {value} now and was {was}"
+            yield f"{prefix}{name}", value, was
+
+
+def _flag(name: str, value: object) -> str:
+    """``--train.grid.num-levels 5``: what gives an option of training this value on the command line."""
+    *groups, option = f"train.{name}".replace("_", "-").split(".")
+    if isinstance(value, bool):
+        return f"--{'.'.join([*groups, option if value else f'no-{option}'])}"
+    return f"--{'.'.join([*groups, option])} {value}"
 
 
 def _same_inputs(digests: dict[str, str], inputs: Inputs) -> None:

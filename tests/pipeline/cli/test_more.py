@@ -98,7 +98,7 @@ def test_an_interrupted_more_is_taken_up_by_the_same_words(trained, monkeypatch:
         (["--more", "0steps"], 2, "--more needs at least one step"),
         (["--more", "5steps", "--train.steps", "99"], 2, "--more and --train.steps are two budgets; give one"),
         (["--more", "5steps", "--train.preset", "high"], 2, "--more and --train.preset are two budgets; give one"),
-        (["--more", "5steps", "--train.learning-rate", "0.5"], 14, "learning_rate is 0.5 now and was 0.02"),
+        (["--more", "5steps", "--train.learning-rate", "0.5"], 14, "Give --train.learning-rate 0.02. Train"),
     ],
 )
 def test_what_does_not_go_together_is_said(trained, capsys: pytest.CaptureFixture[str], words, code, message):
