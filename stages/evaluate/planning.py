@@ -10,7 +10,7 @@ from stages.evaluate.scoring import fits_poses
 from stages.evaluate.seconds import MIN_RENDERING, SHARE, other_seconds
 from stages.evaluate.tiles import PREVIEW_SHARE
 from stages.hardware.device import cores
-from stages.io.amounts import duration, short_count
+from stages.io.amounts import counted, duration, short_count
 from stages.io.files import read_json, read_scene
 from stages.io.photos import spread
 from stages.render.renderer import TimeBudget, measured_speed
@@ -39,9 +39,10 @@ def affordable_fraction(config: "Config", inputs: Inputs, progress: Progress) ->
     whole = pixels * (renders / speed + SECONDS_PER_PIXEL / cores())
     fraction = _rounded_down(time_budget.seconds_left() / whole, (renders + PREVIEW_SHARE) / renders)
     if fraction < 1:
+        photos = counted(len(test), "test photo")
         progress.note(
             "evaluate.some-pixels",
-            f"only part of the pixels of {len(test)} test photos is scored: all would take about {duration(whole)} at "
+            f"only part of the pixels of {photos} is scored: all would take about {duration(whole)} at "
             f"{short_count(speed)} rays/s, {time_budget.message()}; --evaluate.fraction 1 scores all",
         )
     return fraction

@@ -20,9 +20,10 @@ from stages.effects.image_effects import held_out_words, photo_effects, refines_
 from stages.evaluate.baselines import MeanPhoto, mean_photo, nearest_view, resized
 from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
 from stages.evaluate.image_metrics import error_map, ssim
-from stages.evaluate.summary import FIGURES, line_of, overall, photos_in_words, verdict
+from stages.evaluate.summary import FIGURES, line_of, overall, verdict
 from stages.evaluate.tiles import PREVIEW_SHARE, Tiles, tiles_of
 from stages.hardware.cluster import fan_out
+from stages.io.amounts import counted
 from stages.io.files import read_json, read_scene, write_json, write_png
 from stages.render.renderer import Renderer, load_renderer
 from stages.train.config import BLACK, WHITE
@@ -86,7 +87,7 @@ def score(scorer: "Scorer", folder: Path, progress: Progress, reload: Callable[[
     views = [view for view in test if (mask := scorer.mask(view)) is None or mask.any()]
     notes = list[Note]()
     if masked := len(test) - len(views):
-        what = f"masks leave nothing of {photos_in_words(masked)} to score at this size"
+        what = f"masks leave nothing of {counted(masked)} to score at this size"
         notes.append(Note("evaluate.masked", what))
         progress.note(*notes[-1])
     if not views:

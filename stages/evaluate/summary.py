@@ -5,6 +5,7 @@ from typing import Any
 
 from stages.contract import Note
 from stages.evaluate.image_metrics import ERROR_SCALE, MIN_FOR_INTERVAL, mean_interval
+from stages.io.amounts import counted
 from stages.train.data import MAX_SCORED_SIDE
 
 RIGHT_HALVES = ("psnr_right_half", "psnr_exposure_fitted", "psnr_pose_fitted")
@@ -29,11 +30,11 @@ def overall(images: list[dict[str, Any]], test_photos: int, notes: list[Note]) -
         what = f"{UNMEASURED[test_photos > 0]}, so nothing is measured"
         more.append(Note("evaluate.nothing-measured", what))
     elif len(images) < MIN_FOR_INTERVAL:
-        what = f"no interval: {photos_in_words(len(images))} cannot show how much the figures vary"
+        what = f"no interval: {counted(len(images))} cannot show how much the figures vary"
         more.append(Note("evaluate.no-interval", what))
     if small := sum(image["psnr_right_half"] is None for image in images):
         why = "a half has too few pixels to fit an exposure or to score it"
-        what = f"no half-image PSNR of {photos_in_words(small)}: {why}"
+        what = f"no half-image PSNR of {counted(small)}: {why}"
         more.append(Note("evaluate.small-halves", what))
     return metrics | {
         "lpips": None,
@@ -70,7 +71,7 @@ def verdict(metrics: dict[str, Any]) -> str:
     elif max(metrics["scored_size"]) < MIN_TRUSTED_WIDTH * min(max(metrics["photo_size"]), MAX_SCORED_SIDE):
         what = f"Sharp as a small image, with finer detail unscored: {figures}, {gain}"
     elif metrics["photos_scored"] < MIN_FOR_INTERVAL:
-        what = f"Sharp, as far as {photos_in_words(metrics['photos_scored'])} can tell: {figures}, {gain}"
+        what = f"Sharp, as far as {counted(metrics['photos_scored'])} can tell: {figures}, {gain}"
     else:
         what = f"Sharp and trustworthy: {figures}, {gain}"
     return what + "."
@@ -93,14 +94,14 @@ def line_of(metrics: dict[str, Any]) -> str:
 def scored_on(metrics: dict[str, Any]) -> str:
     """25% of each of 11 photos at 1600 × 1067 (trained at 800 × 534)."""
     scored, test = metrics["photos_scored"], metrics["photos_test"]
-    count = photos_in_words(scored) if scored == test else f"{scored} of {photos_in_words(test)}"
+    count = counted(scored) if scored == test else f"{scored} of {counted(test)}"
     return f"{_part(metrics, scored)}{count} at {_sizes(metrics)}"
 
 
 def _unseen(metrics: dict[str, Any]) -> str:
     """25% of each of 11 test photos at 1600 × 1067 (trained at 800 × 534)."""
     scored = metrics["photos_scored"]
-    return f"{_part(metrics, scored)}{photos_in_words(scored, 'test photo')} at {_sizes(metrics)}"
+    return f"{_part(metrics, scored)}{counted(scored, 'test photo')} at {_sizes(metrics)}"
 
 
 def _part(metrics: dict[str, Any], photos: int) -> str:
@@ -122,11 +123,6 @@ def _right_halves(metrics: dict[str, Any]) -> str:
         return ""
     words = f" · right halves {right:.1f} dB, {fitted:.1f} dB with the exposure fitted on the left half"
     return words if posed is None else f"{words}, {posed:.1f} dB with the pose, too"
-
-
-def photos_in_words(count: int, one: str = "photo") -> str:
-    """1 photo, 2 photos."""
-    return f"{count} {one}" if count == 1 else f"{count} {one}s"
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

@@ -20,6 +20,7 @@ from stages.ingest.sources import (
     unused_cameras,
     unused_masks,
 )
+from stages.io.amounts import counted
 from stages.io.photos import Photo, Rejection
 
 MAX_NOTES = 10
@@ -221,7 +222,7 @@ def grey_masks(names: Sequence[str]) -> list[Note]:
     """A note on photos whose masks are in shades of grey."""
     if not names:
         return []
-    words = f"masks of {len(names)} photos are mostly grey"
+    words = f"masks of {counted(len(names))} are mostly grey"
     words = f"{words}: pixels brighter than half are used. Check the masks of {listed([shown(n) for n in names], 3)}"
     return [Note("ingest.grey-masks", words)]
 
@@ -230,7 +231,7 @@ def taken_as_upright(names: Sequence[str]) -> list[Note]:
     """A note on photos that EXIF turned and whose masks fit them turned or not."""
     if not names:
         return []
-    which = f"the masks of {len(names)} photos fit both upright and before EXIF rotation"
+    which = f"the masks of {counted(len(names))} fit both upright and before EXIF rotation"
     words = f"{which}; they are taken as upright. Check the masks of {_few([shown(name) for name in names])}"
     return [Note("ingest.ambiguous-masks", words)]
 

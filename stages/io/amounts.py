@@ -13,6 +13,11 @@ def short_count(count: float) -> str:
     return f"{count:.0f}"
 
 
+def counted(count: int, one: str = "photo") -> str:
+    """``1 photo``, ``2 photos``: so many things, each called ``one``."""
+    return f"{count:,} {one}" if count == 1 else f"{count:,} {one}s"
+
+
 def duration(seconds: float) -> str:
     """``0.4 s``, ``58 s``, ``3 min 20 s``, ``1 h 5 min``: seconds as people say them."""
     if seconds < 9.95:

@@ -14,7 +14,7 @@ from stages.contract import Inputs, Progress, SilentProgress, StageError, StageR
 from stages.effects.decisions import read_decisions
 from stages.evaluate.tiles import MIN_TILES, TILE_SIZE
 from stages.hardware.cluster import fan_out
-from stages.io.amounts import duration, duration_option, resolution_name
+from stages.io.amounts import counted, duration, duration_option, resolution_name
 from stages.io.files import read_scene, write_json
 from stages.io.stopwatch import counting
 from stages.tradeoff import plots
@@ -151,7 +151,7 @@ def schedule_lines(schedule: Schedule, seconds: float, runs: Path) -> list[str]:
     expected = sum(run.seconds for run in to_do)
     done = f", {len(schedule.runs) - len(to_do)} of them done" if len(to_do) < len(schedule.runs) else ""
     finish = time.strftime("%H:%M", time.localtime(time.time() + expected))
-    lines = [f"{len(schedule.runs)} runs{done}: about {duration(expected)}, until {finish}"]
+    lines = [f"{counted(len(schedule.runs), 'run')}{done}: about {duration(expected)}, until {finish}"]
     lines.append(f"about {duration(schedule.seconds)} of {duration(seconds)} in all")
     for variant in VARIANTS:
         chosen = [run for run in schedule.runs if run.variant == variant]
@@ -295,7 +295,8 @@ def save_study(config: "Config", outcome: Outcome, folder: Path, workspace: str)
     (folder / "tradeoff.md").write_text(plots.markdown(study), "utf-8")
     plots.write_plot(study, folder)
     pictures = _ablation_sheet(outcome, study["ablation"], folder)
-    line = f"{len(points)} settings, {sum(row['pareto_front'] for row in study['points'])} on the Pareto front · "
+    on_front = sum(row["pareto_front"] for row in study["points"])
+    line = f"{counted(len(points), 'setting')}, {on_front} on the Pareto front · "
     if failed := sum(figures["failed"] is not None for _, figures in results):
         line += f"{failed} of {len(results)} runs without a result · "
     line += f"{recommendation.words} Train it: {study['command']}"

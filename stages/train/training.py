@@ -26,7 +26,7 @@ from stages.effects.image_effects import image_effects, learnt_effects
 from stages.hardware.device import compute_device
 from stages.hardware.memory import check_memory
 from stages.hardware.ranks import check_ranks, leading, rank_count, tasks_of_first_rank
-from stages.io.amounts import short_count
+from stages.io.amounts import counted, short_count
 from stages.io.field_files import save_field
 from stages.io.files import read_scene
 from stages.train.checkpoints import checkpoint_files
@@ -206,7 +206,7 @@ def ranks_message(ranks: Ranks, config: Config) -> str:
 def _note_sizes(config: Config, budget: TrainingBudget, dataset: RayDataset, progress: Progress) -> None:
     amount = f"{budget.seconds:g} s" if budget.steps is None else f"{budget.steps:,} steps"
     another = "" if budget.after is None else "another "
-    photos = f"{len(dataset.near)} photos at 1/{config.downscale:g} of their size"
+    photos = f"{counted(len(dataset.near))} at 1/{config.downscale:g} of their size"
     field = field_of(config)
     sizes = f"{config.field} field ({field.sizes_in_words(config)})"
     progress.note("train.sizes", f"{sizes}, {another}{amount} · {photos}, {short_count(len(dataset.pixels))} pixels")

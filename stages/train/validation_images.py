@@ -20,6 +20,7 @@ from nerf.training.trainer import FieldTrainer
 from stages.contract import Progress, StageError
 from stages.effects.image_effects import held_out_images
 from stages.evaluate.image_metrics import ssim
+from stages.io.amounts import counted
 from stages.io.photos import spread
 from stages.train.config import Config
 from stages.train.data import ALL_MASKED, field_background, training_dataset
@@ -102,7 +103,7 @@ def with_validation_split(scene: Scene) -> Scene:
     split = split_off_validation(scene, MAX_VALIDATION_PHOTOS)
     if split is None:
         count = len(scene.of_split("train"))
-        why = f"it needs validation photos, and {count} training photos are too few to spare any"
+        why = f"it needs validation photos, and {counted(count, 'training photo')} cannot spare any"
         raise StageError(
             "train.few-photos-for-target", "cannot train to a target PSNR", why, "Leave out --target-psnr."
         )

@@ -8,6 +8,7 @@ import numpy as np
 
 from stages.contract import Note, StageError
 from stages.ingest.sources import own_registration
+from stages.io.amounts import counted
 from stages.io.photos import Photo
 from stages.io.sparse_model import SparseModel
 from stages.sfm.colmap.cameras import pixel_map
@@ -59,7 +60,7 @@ def read_colmap_model(folder: Path, photos: Sequence[Photo], convention: PoseCon
         )
     if repeated:
         names = few(sorted(given.images[i].file for i in repeated))
-        notes.append(Note("sfm.repeated-images", f"the model repeats {len(repeated)} images: {names}"))
+        notes.append(Note("sfm.repeated-images", f"the model repeats {counted(len(repeated), 'image')}: {names}"))
     if not len(given.xyz):
         notes.append(
             Note(

@@ -9,6 +9,7 @@ import numpy as np
 
 from nerf.geometry.scene import Camera
 from stages.contract import Note, StageError, listed
+from stages.io.amounts import counted
 from stages.io.photos import Photo
 from stages.io.sparse_model import SparseModel
 from stages.io.transforms_files import (
@@ -138,7 +139,9 @@ def _on_frames(found: _MatchedFrames, repeated: Sequence[str]) -> list[Note]:
     """Notes on frames that are listed twice, have no pose, or say that their camera model is another."""
     notes = []
     if repeated:
-        notes.append(Note("sfm.repeated-frames", f"the file repeats {len(repeated)} frames: {few(repeated)}"))
+        notes.append(
+            Note("sfm.repeated-frames", f"the file repeats {counted(len(repeated), 'frame')}: {few(repeated)}")
+        )
     approximate = [one for one in found.framed.values() if str(one.values.get("note", "")).startswith(APPROXIMATION)]
     if approximate:
         words = f"the camera models of {len(approximate)} frames are approximations, according to the notes in the file"

@@ -253,7 +253,7 @@ def test_the_fraction_scored_is_what_there_is_time_for(make: Make, tmp_path: Pat
         return evaluate.plan(evaluate.Config(**asked), inputs, progress).fraction
 
     assert fraction() == pytest.approx(seconds.MIN_RENDERING / 10 / 1.25, abs=0.03)
-    assert progress.codes == ["evaluate.some-pixels"]
+    assert progress.names("evaluate.some-pixels", " 4 test photos is")
     assert fraction(seconds=20.0) == 1 and len(progress.notes) == 1
     assert 0.08 < fraction(seconds=4.0) < 0.2  # type: ignore[operator]
     assert 0.03 < fraction(seconds=0.1) < 0.045  # type: ignore[operator] # half a second in any case

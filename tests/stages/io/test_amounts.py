@@ -1,6 +1,14 @@
 import pytest
 
-from stages.io.amounts import bytes_in_words, duration, duration_option, least_duration, rough_duration, short_count
+from stages.io.amounts import (
+    bytes_in_words,
+    counted,
+    duration,
+    duration_option,
+    least_duration,
+    rough_duration,
+    short_count,
+)
 
 
 @pytest.mark.parametrize(
@@ -55,3 +63,8 @@ def test_times_as_options(seconds: float, words: str) -> None:
 
 def test_bytes() -> None:
     assert (bytes_in_words(2**30 * 1.26), bytes_in_words(2**20 * 40)) == ("1.3 GB", "40 MB")
+
+
+def test_one_thing_is_not_several() -> None:
+    assert [counted(number, "test photo") for number in (0, 1, 2)] == ["0 test photos", "1 test photo", "2 test photos"]
+    assert (counted(1), counted(1234)) == ("1 photo", "1,234 photos")
