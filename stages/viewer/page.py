@@ -33,8 +33,13 @@ def save(contents: "Contents", folder: Path) -> StageResult:
         return StageResult(("viewer.html",), "this field cannot be shown in a browser", facts={"drawn": False})
     bits = contents.header["field"]["bits"]
     facts = {"drawn": True, "bits": bits, "loss_db": contents.loss_db, "bytes": size}
-    line = f"{bytes_in_words(size)} · {bits} bits a number, {contents.loss_db:+.3f} dB lost"
+    line = f"{bytes_in_words(size)} · {bits} bits a number, {_loss(contents.loss_db)}"
     return StageResult(("viewer.html",), line, facts=facts)
+
+
+def _loss(loss_db: float) -> str:
+    """``0.004 dB lost``: rounding may also happen to gain a little."""
+    return f"{abs(loss_db):.3f} dB {'gained' if round(loss_db, 3) < 0 else 'lost'}"
 
 
 def packed(contents: "Contents") -> str:

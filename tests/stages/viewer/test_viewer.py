@@ -20,7 +20,8 @@ from stages.contract import run_stage
 from stages.io.field_files import save_field
 from stages.io.files import read_json, write_json
 from stages.viewer import contents
-from stages.viewer.contents import photo_side
+from stages.viewer.contents import Contents, photo_side
+from stages.viewer.page import save
 from stages.viewer.tables import quantised, sections, with_table
 from tests.conftest import RecordedProgress
 from tests.stages.viewer.made_fields import NAMES, Made, made, renamed
@@ -152,6 +153,14 @@ def test_a_vanilla_nerf_has_a_page_that_says_why_not(tmp_path: Path):
     text = (tmp_path / "page/viewer.html").read_text("utf-8")
     assert progress.codes == ["viewer.not-rendered"] and result.facts == {"drawn": False}
     assert "vanilla NeRF" in text and "<script" not in text
+
+
+@pytest.mark.parametrize(
+    ("loss_db", "words"),
+    [(0.0041, "0.004 dB lost"), (-0.0021, "0.002 dB gained"), (-0.0002, " 0.000 dB lost"), (0.0, " 0.000 dB lost")],
+)
+def test_a_loss_below_nothing_is_a_gain(tmp_path: Path, loss_db: float, words: str):
+    assert save(Contents({"field": {"bits": 8}, "name": "it"}, {}, loss_db), tmp_path).line.endswith(words)
 
 
 def test_small_photos_of_a_large_set_are_smaller():
