@@ -160,6 +160,8 @@ def command_run(words: Sequence[str]) -> int:
     stages = stage_list.up_to(_known_stage(given.until or list(stage_list.STAGES)[-1], "--until"), dict(asked))
     force = frozenset[str]()
     if given.from_ is not None:
+        if given.from_ in stage_list.usual() and given.from_ not in stages:
+            raise UsageError(f"--from {given.from_} and --until {given.until}: the run ends before that stage")
         force = frozenset(stages[stages.index(_known_stage(given.from_, "--from", stages)) :])
     budget = _budget(given.budget, asked)
     _check_budget(budget, stages, given.until, root)

@@ -46,7 +46,8 @@ def test_help_of_run_lists_the_stage_options(capsys: pytest.CaptureFixture[str])
     ("words", "message"),
     [
         (["--until", "lunch"], "--until lunch: not one of ingest, sfm"),
-        (["--until", "sfm", "--from", "mesh"], "--from mesh: not one of ingest, sfm"),
+        (["--until", "sfm", "--from", "mesh"], "--from mesh and --until sfm: the run ends before that"),
+        (["--from", "tradeoff"], "--from tradeoff: not one of ingest, sfm"),
         (["--config", "missing.toml"], "--config missing.toml: No such file"),
         (["--train.steps", "0", "--train.downscale", "0.5"], "--train.steps 0 must be at least 1; "
          "--train.downscale 0.5 must be at least 1 (pipeline run --help)"),
