@@ -16,6 +16,7 @@ from nerf.geometry.region_of_interest import (
     beyond_alpha,
     find_capture_type,
     find_region,
+    grown,
     share_beyond,
 )
 from nerf.geometry.scene import Similarity
@@ -66,10 +67,12 @@ def normalise(
     _check_extent(sfm, middle)
     upright = sfm.in_frame(rotation, middle)
     given = None if roi is None else Region(rotation @ (np.array(roi[:3]) - middle), roi[3])
-    contradicted = 0.0 if upright.opaque is None else beyond_alpha(upright, capture_type, given)
+    cube = given or find_region(upright, capture_type)
+    contradicted = 0.0 if upright.opaque is None else beyond_alpha(upright, cube, may_grow=given is None)
     if contradicted >= GOES_ON:
         upright = replace(upright, opaque=None)
-    region = given or find_region(upright, capture_type)
+        cube = given or find_region(upright, capture_type)
+    region = given or grown(cube, upright)
     if not region.half >= MIN_HALF_SIZE:
         raise ValueError(f"it is {region.half:.2g} units large, and it needs at least {MIN_HALF_SIZE:g}")
     scale = REGION_HALF_SIZE / region.half

@@ -70,7 +70,7 @@ def look_at_point(
 
 
 def find_region(scene: Reconstruction, capture_type: CaptureType) -> Region:
-    """The cube, aligned with the axes of the frame ``scene`` is in.
+    """The cube, aligned with the axes of the frame ``scene`` is in, before it is :func:`grown`.
 
     Object-centric: centred on the focus, holding 95 % of the observed points but not reaching beyond the cameras.
     Forward-facing: the photos' frusta between the nearest and farthest observed depths. Inside-out: the observed points
@@ -78,29 +78,22 @@ def find_region(scene: Reconstruction, capture_type: CaptureType) -> Region:
     whole.
     Raises ValueError when the cameras stand in one place and there are no points to give a scale.
     """
-    cube = _ungrown(scene, capture_type)
+    if capture_type == "object-centric" and scene.opaque is not None:
+        cube = _carved(scene, scene.opaque)
+    else:
+        find = {"object-centric": _object_centric, "forward-facing": _forward_facing, "inside-out": _inside_out}
+        cube = find[capture_type](scene)
     if not cube.half > 0:
         raise ValueError("all cameras have the same position, and there are no points")
-    return _grown(cube, scene)
+    return cube
 
 
-def beyond_alpha(scene: Reconstruction, capture_type: CaptureType, given: Region | None = None) -> float:
+def beyond_alpha(scene: Reconstruction, cube: Region, may_grow: bool) -> float:
     """The share of observations that contradict photos with alpha, by which there is no more than the cube: their
-    points lie beyond the one ``given``, or beyond the one found, even when it is grown. 0 without observations."""
+    points lie beyond it, even when it is grown where it may. 0 without observations."""
     if not len(scene.point):
         return 0.0
-    if given is not None:
-        return share_beyond(scene, given.centre, given.half)
-    cube = _ungrown(scene, capture_type)
-    return share_beyond(scene, cube.centre, GROWTH * cube.half)
-
-
-def _ungrown(scene: Reconstruction, capture_type: CaptureType) -> Region:
-    if capture_type == "object-centric" and scene.opaque is not None:
-        return _carved(scene, scene.opaque)
-    return {"object-centric": _object_centric, "forward-facing": _forward_facing, "inside-out": _inside_out}[
-        capture_type
-    ](scene)
+    return share_beyond(scene, cube.centre, (GROWTH if may_grow else 1) * cube.half)
 
 
 def share_beyond(scene: Reconstruction, centre: Float[np.ndarray, "3"], half: float) -> float:
@@ -114,7 +107,7 @@ def _reach(scene: Reconstruction, centre: Float[np.ndarray, "3"]) -> Float[np.nd
     return np.abs(scene.points - centre).max(axis=1, initial=0.0)[scene.point]
 
 
-def _grown(cube: Region, scene: Reconstruction) -> Region:
+def grown(cube: Region, scene: Reconstruction) -> Region:
     """Let the cube hold the whole scene where that costs little; or as much of it as costs little where alpha says that
     there is no more, for then what is beyond is not shown at all."""
     if not len(scene.point):

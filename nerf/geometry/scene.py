@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 Split = Literal["train", "validation", "test"]
 """Validation photos are set aside from the training photos while a run is made that asks for them; no file has any."""
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,8 @@ class Similarity:
 @dataclass(frozen=True)
 class View:
     """One photo with its pose. ``near`` and ``far`` are distances along the unit ray in scene units. ``mask`` is a grey
-    picture of the photo's size inside ingest's folder, 0 where the photo is to be ignored; None: nowhere."""
+    picture of the photo's size inside ingest's folder, 0 where the photo is to be ignored; None: nowhere. ``alpha`` is
+    another one, 0 where the photo is transparent and 255 where it is opaque; None: its own alpha tells, if any."""
 
     name: str  # the photo's own name
     file: str  # the decoded image inside ingest's folder
@@ -66,6 +67,7 @@ class View:
     far: float
     split: Split
     mask: str | None = None
+    alpha: str | None = None
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,8 @@ class Scene:
     """Everything that training and rendering need to know of the geometry.
 
     ``bounded``: all that the photos show lies inside the region of interest; otherwise space beyond it is contracted
-    (nerf/geometry/space_maps/contraction.py). ``has_alpha``: the photos' alpha says what is background.
+    (nerf/geometry/space_maps/contraction.py). ``has_alpha``: the photos' alpha, or masks in its
+    place, says what is background.
     ``capture_type``: cameras around an object, cameras that look outward or through a room, or all facing one way.
     """
 

@@ -18,7 +18,7 @@ from stages.depth.consistency import SparseDepths
 from stages.depth.neighbours import Tracks, choose_pairs, depth_range, tracks_of
 from stages.depth.rectification import CannotRectify, Pixels, Rectified, Viewpoint, rectify
 from stages.io.files import read_scene, read_tensors
-from stages.io.pixels import OPAQUE_FROM, even_contrast, load_mask, load_pixels
+from stages.io.pixels import OPAQUE_FROM, even_contrast, load_mask, load_pixels, load_view
 from stages.sfm.colmap.cameras import camera_rays
 
 MAX_DISPARITIES = 512  # of a pair: a surface closer than that is not found by it
@@ -99,7 +99,7 @@ class TrainingPhotos:
 
     def _pixels(self, number: int) -> Pixels:
         view, (width, height) = self.views[number], self.viewpoints[number].size
-        pixels = load_pixels(self.ingest / view.file, width, height)
+        pixels = load_view(self.ingest, view, width, height)
         used = np.ones((height, width), bool)
         if self.scene.has_alpha and pixels.shape[2] == 4:
             used &= pixels[..., 3] >= OPAQUE_FROM

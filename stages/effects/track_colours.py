@@ -19,7 +19,7 @@ from nerf.effects.statistics.tracks import TrackColours
 from nerf.geometry.scene import Scene, View
 from stages.contract import Progress
 from stages.hardware.device import processors
-from stages.io.pixels import load_mask, load_pixels
+from stages.io.pixels import load_mask, load_view
 from stages.sfm.colmap.cameras import mean_focal_and_centre, project
 
 MAX_OBSERVATIONS = 200_000  # observations: gains of 500 photos are then known to a few thousandths
@@ -178,7 +178,7 @@ def _windows(scene: Scene, tracks: TrackColours) -> np.ndarray:
 def _look(ingest: Path, scene: Scene, view: View, places: _Places) -> np.ndarray:
     """Per place red, green, blue, whether it is clipped, and the texture, NaN where it cannot be used."""
     width, height = _size(scene, view)
-    pixels = load_pixels(ingest / view.file, width, height)
+    pixels = load_view(ingest, view, width, height)
     used = pixels[..., 3] == 255 if scene.has_alpha and pixels.shape[2] == 4 else np.ones(pixels.shape[:2], bool)
     if view.mask:
         used = used & load_mask(ingest / view.mask, width, height)

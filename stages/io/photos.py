@@ -105,6 +105,12 @@ def _read(ingest_folder: Path) -> _PhotosFile:
     return read_dataclass(ingest_folder / "photos.json", _PhotosFile)
 
 
+def ends_within(box: Box | None) -> bool:
+    """Whether what a box holds, nothing at all too, ends within its photo on the left and right, or above and below."""
+    left, top, right, bottom = box or (1.0, 1.0, 0.0, 0.0)
+    return (left > 0 and right < 1) or (top > 0 and bottom < 1)
+
+
 def spread(length: int, count: int) -> list[int]:
     """A few of many, evenly: ``count`` indices in the middle of equal parts of a list of ``length``."""
     return [(2 * i + 1) * length // (2 * count) for i in range(count)]

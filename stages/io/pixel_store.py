@@ -44,11 +44,13 @@ FITS = 0.8  # share of the free memory up to which a store is read ahead as a wh
 
 
 class StoredPhoto(NamedTuple):
-    """A photo of a store: its file below ingest's folder, and its size in pixels there."""
+    """A photo of a store: its file below ingest's folder, its size in pixels there, and the file of its alpha where
+    that is another one."""
 
     file: str
     width: int
     height: int
+    alpha: str | None = None
 
 
 Load = Callable[[int], "np.ndarray"]

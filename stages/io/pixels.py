@@ -10,15 +10,20 @@ from types import ModuleType
 import cv2
 import numpy as np
 import pillow_heif
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from PIL import Image
 
+from nerf.geometry.scene import View
 from stages.hardware.device import processors
 from stages.io.photos import Box
 
 OPAQUE_FROM = 128  # of 255: from here on a pixel is more opaque than transparent
 DECODING_BYTES = 1 << 30  # how much memory may go into photos that are being loaded at a time
-BYTES_PER_PIXEL = {3: 16, 4: 80}  # of the file, that loading and shrinking takes, by channels; 10 and 78 measured
+BYTES_PER_PIXEL = {
+    1: 10,
+    3: 16,
+    4: 40,
+}  # of the file, that loading and shrinking takes, by channels; 10 and 39 measured
 
 
 CONTRAST_SCALE = 42.0  # 3 deviations fill 8 bits
@@ -40,30 +45,47 @@ def opaque_box(pixels: np.ndarray) -> Box | None:
     """What holds all that is more than half opaque of (h, w, 3 or 4) uint8; None where all or nothing of it is."""
     if pixels.shape[2] != 4:
         return None
-    opaque = pixels[..., 3] >= OPAQUE_FROM
-    if not opaque.any() or opaque.all():
+    return box_of(pixels[..., 3] >= OPAQUE_FROM)
+
+
+def box_of(inside: Bool[np.ndarray, "h w"]) -> Box | None:
+    """What holds all pixels that are ``inside``; None where all or none of them are."""
+    if not inside.any() or inside.all():
         return None
-    height, width = opaque.shape
-    columns, rows = np.flatnonzero(opaque.any(axis=0)), np.flatnonzero(opaque.any(axis=1))
+    height, width = inside.shape
+    columns, rows = np.flatnonzero(inside.any(axis=0)), np.flatnonzero(inside.any(axis=1))
     left, right = float(columns[0]) / width, float(columns[-1] + 1) / width
     return left, float(rows[0]) / height, right, float(rows[-1] + 1) / height
 
 
-def load_pixels(path: Path, width: int, height: int) -> np.ndarray:
-    """The image as (height, width, 3 or 4) uint8, each pixel the mean of the area it covers.
+def load_view(ingest: Path, view: View, width: int, height: int) -> np.ndarray:
+    """:func:`load_pixels` of a view of the scene, with its alpha."""
+    return load_pixels(ingest / view.file, width, height, None if view.alpha is None else ingest / view.alpha)
+
+
+def load_pixels(path: Path, width: int, height: int, alpha_path: Path | None = None, quick: bool = False) -> np.ndarray:
+    """The image as (height, width, 3 or 4) uint8, each pixel the mean of the area it covers; a grey picture of its size
+    can be its alpha.
 
     The means are taken of sRGB values weighted by alpha (premultiplied); a pixel that nothing covers is black.
-    At the image's own size the values are those stored. Enlarging interpolates linearly.
+    At the image's own size the values are those stored. Enlarging interpolates linearly. ``quick``: a JPEG of at least
+    four times the size is not decoded whole; its values are nearly those means.
     """
     with pillow().open(path) as image:
+        if quick:
+            image.draft(image.mode, (2 * width, 2 * height))
         pixels = np.asarray(image)
+    if alpha_path is not None:
+        with pillow().open(alpha_path) as image:
+            pixels = cv2.merge([*cv2.split(pixels)[:3], np.asarray(image)])
     if (pixels.shape[1], pixels.shape[0]) == (width, height):
         return pixels
     if pixels.shape[2] == 3:
         return cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
-    alpha = pixels[..., 3:].astype(np.float32)
-    premultiplied = np.concatenate([pixels[..., :3] * alpha, alpha], axis=2)
-    resized = cv2.resize(premultiplied, (width, height), interpolation=cv2.INTER_AREA)
+    *colours, alpha = (channel.astype(np.float32) for channel in cv2.split(pixels))
+    for each in colours:
+        each *= alpha
+    resized = cv2.resize(cv2.merge([*colours, alpha]), (width, height), interpolation=cv2.INTER_AREA)
     covered = resized[..., 3:] > 0
     colour = np.divide(resized[..., :3], resized[..., 3:], out=np.zeros_like(resized[..., :3]), where=covered)
     return np.rint(np.concatenate([colour, resized[..., 3:]], axis=2)).astype(np.uint8)
@@ -81,16 +103,19 @@ def even_contrast(
     return np.clip(np.rint(128 + CONTRAST_SCALE * even), 0, 255).astype(np.uint8)
 
 
-def loaders(files: Iterable[Path]) -> int:
-    """How many of these photos, or of their masks, to load at a time, each in a thread: one per core, fewer where they
-    are too large for that. What counts is the size in the file, however small they are made afterwards."""
-    return max(1, min(processors(), DECODING_BYTES // max(map(_loading_bytes, files))))
+def loaders(files: Iterable[Path], channels: int = 0) -> int:
+    """How many of these photos or masks to load at a time, each in a thread: one per core, fewer where they are too
+    large for that. What counts is the size in the file, however small they are made afterwards. ``channels``: that they
+    have at least, together with an alpha of another file."""
+    return max(
+        1, min(processors(), DECODING_BYTES // max((_loading_bytes(file, channels) for file in files), default=1))
+    )
 
 
-def _loading_bytes(file: Path) -> int:
-    """Memory that :func:`load_pixels` takes, by the file's header."""
+def _loading_bytes(file: Path, channels: int) -> int:
+    """Memory that loading takes, by the file's header."""
     with pillow().open(file) as image:
-        return BYTES_PER_PIXEL[len(image.getbands())] * image.width * image.height
+        return BYTES_PER_PIXEL[max(channels, len(image.getbands()))] * image.width * image.height
 
 
 def load_mask(path: Path, width: int, height: int) -> np.ndarray:

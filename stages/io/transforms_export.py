@@ -48,13 +48,13 @@ def transforms(scene: Scene) -> dict[str, Any]:
     used = {view.camera for view in scene.views}
     models = {cameras[camera]["camera_model"] for camera in used}
     shared = len(used) == 1
-    all_masked = all(view.mask for view in scene.views)
+    masks = [view.mask or view.alpha for view in scene.views]
     sfm_from_scene = scene.scene_from_sfm.inverse()
     frames = []
-    for view in scene.views:
+    for view, mask in zip(scene.views, masks, strict=True):
         own = {} if shared else dict(cameras[view.camera])
         pose = opengl_matrix(sfm_from_scene.pose(view.scene_from_camera))
-        own |= {"mask_path": view.mask} if all_masked else {}
+        own |= {"mask_path": mask} if all(masks) else {}
         frames.append(own | {"file_path": view.file, "photo": view.name, "transform_matrix": pose})
     scale = scene.scene_from_sfm.scale / 2  # of instant-ngp: [-1, 1] to [0, 1]
     common = {"camera_model": models.pop()} if len(models) == 1 else {}

@@ -1,6 +1,7 @@
 """Stage normalise: the calibrated scene in our own frame, the split, and the export for other programs."""
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 
@@ -24,6 +25,13 @@ class Config(StageConfig):
             "Hold out every n-th photo by name as a test photo, starting with the first; imported splits are kept."
         ),
     )
+    masks: Auto[Literal["cut-out", "ignore"]] = Field(
+        default=None,
+        description=(
+            "What masks ignore is transparent (cut-out) or unknown (ignore) (default: transparent where they cut out "
+            "an object, as the sparse points tell)."
+        ),
+    )
 
 
 def expected_seconds(config: Config, workload: Workload) -> float:
@@ -41,7 +49,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 STAGE = Stage(
     name="normalise",
     inputs=("ingest", "sfm"),
-    version=17,
+    version=18,
     exit_code=12,
     published=("transforms.json", "scene.json"),
     config=Config,

@@ -17,6 +17,7 @@ from stages.io.files import read_json, write_json, write_tensors
 from stages.io.photos import Box, Photo, read_photos
 from stages.io.sparse_model import SparseModel
 from stages.io.transforms_export import transforms
+from stages.normalise.alpha import Alpha, alpha_or_none, find_alpha
 from stages.normalise.split import split_photos
 from stages.sfm.colmap.cameras import camera_rays
 from stages.sfm.colmap.models import read_model
@@ -41,13 +42,13 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
         ((by_file[f"images/{image.file}"], i) for i, image in enumerate(model.images)), key=lambda pair: pair[0].name
     )
     photos, order = [photo for photo, _ in posed], [i for _, i in posed]
-    has_alpha = _has_alpha(photos, progress, tracked=len(model.view) > 0)
+    alpha = find_alpha(inputs["ingest"], photos, model, order, config.masks, progress)
     registration = read_json(inputs["sfm"] / "registration.json")
     official = registration["test_files"]
     split = split_photos(photos, config.test_every, official)
     # What is opaque in a test photo decides nothing.
-    boxes = [photo.opaque if part == "train" else None for photo, part in zip(photos, split, strict=True)]
-    sfm = _reconstruction(model, order, boxes if has_alpha else None)
+    boxes = alpha and [box if part == "train" else None for box, part in zip(alpha.opaque, split, strict=True)]
+    sfm = _reconstruction(model, order, boxes)
     try:
         found = normalise(sfm, config.roi, _up_by_gps(registration["georeference"], sfm, photos))
     except ValueError as error:
@@ -60,18 +61,14 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
             "the others are held out as test photos",
             f"Add training photos, or {'change the given split' if official else 'raise --normalise.test-every'}.",
         )
-    if has_alpha and not found.bounded:
-        where = "the opaque parts of the photos" if config.roi is None else "the given region"
-        progress.note(
-            "normalise.alpha-beyond-region",
-            f"{found.beyond_alpha:.1%} of the tracked points lie outside {where}: the scene continues there, so "
-            "transparent parts are ignored like masked ones",
-        )
-    scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split)
+    if alpha is not None:
+        alpha = alpha_or_none(alpha, photos, found, config.roi is not None, progress)
+    scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split, alpha)
     write_json(folder / "scene.json", scene.to_json())
     write_tensors(folder / "points.safetensors", _points(model, sfm, found))
     write_json(folder / "transforms.json", transforms(scene))
-    if (without := sum(view.mask is None for view in scene.views)) and any(photo.mask for photo in photos):
+    masks = [view.mask or view.alpha for view in scene.views]
+    if (without := masks.count(None)) and any(photo.mask for photo in photos):
         them = f"{without} of {len(scene.views)} photos have none"
         progress.note(
             "normalise.no-masks-exported",
@@ -99,34 +96,6 @@ def _check(config: "Config", views: int) -> None:
             "the fourth number, half the side of the region, must be above 0",
             "Give x y z radius in the frame of output/transforms.json.",
         )
-
-
-def _has_alpha(photos: list[Photo], progress: Progress, tracked: bool) -> bool:
-    """Whether the photos may say what is background: most have transparent parts, and most of these show what is opaque
-    from one of its sides to the other, as one sees a thing. Outdoors without a sky one does not, nor in photos with
-    empty corners. Where nothing is tracked, which would tell, all alpha counts. Exceptions are said."""
-    transparent = sum(photo.has_alpha for photo in photos)
-    framing = sum(photo.has_alpha and _ends_within(photo.opaque) for photo in photos) if tracked else transparent
-    opaque = len(photos) - transparent
-    has_alpha = transparent > opaque and 2 * framing > transparent
-    if has_alpha and opaque:
-        progress.note(
-            "normalise.opaque-photos",
-            f"{opaque} of {len(photos)} photos have no transparent parts and count as opaque",
-        )
-    elif transparent and not has_alpha:
-        why = "most photos have none" if transparent <= opaque else "few photos show the opaque object whole"
-        progress.note(
-            "normalise.alpha-ignored",
-            f"transparent parts of {transparent} of {len(photos)} photos are ignored like masked ones: {why}",
-        )
-    return has_alpha
-
-
-def _ends_within(opaque: Box | None) -> bool:
-    """Whether what is opaque, nothing at all too, ends within its photo on the left and right, or above and below."""
-    left, top, right, bottom = opaque or (1.0, 1.0, 0.0, 0.0)
-    return (left > 0 and right < 1) or (top > 0 and bottom < 1)
 
 
 def _reconstruction(model: SparseModel, order: list[int], boxes: Sequence[Box | None] | None) -> Reconstruction:
@@ -176,9 +145,11 @@ def _scene(
     cameras: Sequence[Camera],
     found: Normalisation,
     split: list[Split],
+    alpha: Alpha | None,
 ) -> Scene:
-    """The scene, its views in order of name. Alpha that is no background is one more mask."""
+    """The scene, its views in order of name. ``alpha`` None: alpha that is no background is one more mask."""
 
+    of_masks = [None] * len(photos) if alpha is None else alpha.masks
     views = tuple(
         View(
             name=photo.name,
@@ -188,7 +159,8 @@ def _scene(
             near=float(found.near[i]),
             far=float(found.far[i]),
             split=split[i],
-            mask=photo.mask if found.bounded else photo.opaque_mask or photo.mask,
+            mask=_left_as_mask(photo, of_masks[i], found.bounded),
+            alpha=of_masks[i],
         )
         for i, photo in enumerate(photos)
     )
@@ -201,6 +173,13 @@ def _scene(
         capture_type=found.capture_type,
         up_known=found.up.known,
     )
+
+
+def _left_as_mask(photo: Photo, alpha: str | None, bounded: bool) -> str | None:
+    """The mask of a photo's view, beside the one that is its ``alpha``."""
+    if not bounded:
+        return photo.opaque_mask or photo.mask
+    return None if alpha else photo.mask
 
 
 def _points(model: SparseModel, sfm: Reconstruction, found: Normalisation) -> dict[str, np.ndarray]:

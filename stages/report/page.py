@@ -17,7 +17,7 @@ from stages.evaluate.summary import scored_on
 from stages.io.amounts import duration, short_count
 from stages.io.ascii_names import shell_quoted
 from stages.io.files import SMALL_COPY, read_json, read_scene, read_tensors
-from stages.io.pixels import load_pixels, pillow
+from stages.io.pixels import load_view, pillow
 from stages.report.cameras import (
     CameraReport,
     camera_models,
@@ -355,7 +355,7 @@ def _pictures(results: Results, image: dict[str, Any], width: int) -> dict[str, 
     size = (min(width, render.width), max(1, round(render.height * min(1, width / render.width))))
     assert results.metrics is not None
     background = round(255 * results.metrics["background"][0])
-    photo = Image.fromarray(_opaque(load_pixels(results.inputs["ingest"] / view.file, *size), background))
+    photo = Image.fromarray(_opaque(load_view(results.inputs["ingest"], view, *size), background))
     pictures = {"photo": photo, "render": render.resize(size, Image.Resampling.BOX), "error": error.resize(size)}
     aspect = round(size[0] / size[1], 4)
     return image | {"aspect": aspect} | {name: jpeg_uri(picture) for name, picture in pictures.items()}

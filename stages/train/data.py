@@ -18,7 +18,7 @@ from stages.depth.files import depth_map_file, read_depth_map
 from stages.effects.track_colours import training_tracks
 from stages.io.files import read_tensors
 from stages.io.pixel_store import PixelStore, StoredPhoto, fill, pixel_store
-from stages.io.pixels import load_mask, load_pixels, loaders
+from stages.io.pixels import load_mask, load_view, loaders
 from stages.sfm.colmap.cameras import camera_rays
 from stages.train.config import BLACK, WHITE, Config
 
@@ -71,7 +71,9 @@ def training_dataset(
     """All pixels and rays of one split, on the CPU; the pixels are mapped from the pixel store, which is made if need
     be. What masks ignore is never drawn. Raises StageError, ALL_MASKED, where they leave nothing."""
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
-    at_once = cache(lambda: loaders(ingest / view.file for view in views))  # opens every file
+    at_once = cache(
+        lambda: loaders((ingest / view.file for view in views), channels=4 * scene.has_alpha)
+    )  # opens every file
     fill(store, lambda index: _decoded_pixels(ingest, scene, views[index], downscale), at_once, progress)
     used = sorted({view.camera for view in views})
 
@@ -185,13 +187,13 @@ class PhotoReader:
 def _store(ingest: Path, scene: "Scene", split: "Split", downscale: float | None) -> PixelStore:
     """Where the pixels of one split at this size are kept, whether or not they are there yet."""
     views = scene.of_split(split)
-    photos = [StoredPhoto(view.file, *scaled_size(scene.cameras[view.camera], downscale)) for view in views]
+    photos = [StoredPhoto(view.file, *scaled_size(scene.cameras[view.camera], downscale), view.alpha) for view in views]
     return pixel_store(ingest, split, photos, 4 if scene.has_alpha else 3)
 
 
 def _decoded_pixels(ingest: Path, scene: "Scene", view: "View", downscale: float | None) -> np.ndarray:
     """The photo of a view as uint8: (H, W, 4) in a scene with alpha, else (H, W, 3) as it is below its alpha."""
-    pixels = load_pixels(ingest / view.file, *scaled_size(scene.cameras[view.camera], downscale))
+    pixels = load_view(ingest, view, *scaled_size(scene.cameras[view.camera], downscale))
     if scene.has_alpha and pixels.shape[2] == 3:  # a photo without transparent parts covers every pixel
         return np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=2)
     return pixels if scene.has_alpha else np.ascontiguousarray(pixels[..., :3])

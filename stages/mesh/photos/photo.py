@@ -103,11 +103,13 @@ def read_picture(photo: Photo, downscale: float) -> Picture:
     """
     width, height = (max(1, round(side / downscale)) for side in (photo.camera.width, photo.camera.height))
     try:
-        pixels = load_pixels(photo.folder / photo.view.file, width, height)
+        pixels = load_pixels(photo.folder / photo.view.file, width, height, quick=True)
     except OSError as error:
         raise _unreadable(photo, error) from error
-    mask = None if photo.view.mask is None else _mask(photo, width, height)
-    used = np.ones((height, width), np.uint8) if mask is None else mask.astype(np.uint8)
+    used = np.ones((height, width), np.uint8)
+    for mask in (photo.view.mask, photo.view.alpha):
+        if mask is not None:
+            used &= _mask(photo, mask, width, height)
     if photo.has_alpha and pixels.shape[2] == 4:
         opaque = (pixels[..., 3] >= OPAQUE_FROM).astype(np.uint8)
         inside = cv2.erode(opaque, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
@@ -122,13 +124,12 @@ def unmasked(photo: Photo, place: Projection) -> np.ndarray:
         return np.ones(len(place.pixels), bool)
     width, height = photo.camera.width, photo.camera.height
     column, row = place.pixels.astype(np.int64).clip(0, [width - 1, height - 1]).T
-    return _mask(photo, width, height)[row, column]
+    return _mask(photo, photo.view.mask, width, height)[row, column]
 
 
-def _mask(photo: Photo, width: int, height: int) -> np.ndarray:
-    assert photo.view.mask is not None
+def _mask(photo: Photo, file: str, width: int, height: int) -> np.ndarray:
     try:
-        return load_mask(photo.folder / photo.view.mask, width, height)
+        return load_mask(photo.folder / file, width, height)
     except OSError as error:
         raise _unreadable(photo, error) from error
 

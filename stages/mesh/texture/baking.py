@@ -18,6 +18,7 @@ import torch
 from scipy.sparse import csr_array
 
 from nerf.runtime.parallel import in_order
+from stages.io.pixels import loaders
 from stages.mesh.photos.photo import Photo, Picture, colours_at, projected, read_picture
 from stages.mesh.rasteriser import barycentric, covered_pixels
 from stages.mesh.surface import Surface
@@ -48,14 +49,15 @@ def bake(
         light[texel] = _within(corner, rest[surface.faces[face]])
         covered[texel] = True
 
-    # The next photo is decoded on a thread of its own while the cores bake this one.
+    # The next photos are decoded on threads of their own while the cores bake this one.
     used = [index for index in range(len(photos)) if len(choice.weights[index][0])]
-    with ThreadPoolExecutor(1) as ahead:
+    count = loaders(photos[index].folder / photos[index].view.file for index in used)
+    with ThreadPoolExecutor(count) as ahead:
         read = partial(read_picture, downscale=max(1.0, 1 / atlas.texels_per_pixel))
-        upcoming = deque(ahead.submit(read, photos[index]) for index in used[:1])
+        upcoming = deque(ahead.submit(read, photos[index]) for index in used[:count])
         for done, index in enumerate(used):
             picture = upcoming.popleft().result()
-            upcoming.extend(ahead.submit(read, photos[following]) for following in used[done + 1 : done + 2])
+            upcoming.extend(ahead.submit(read, photos[index]) for index in used[done + count : done + count + 1])
             for texel, colour in _of_photo(surface, atlas, (photos[index], picture), index, choice, means):
                 light[texel] += colour
             on_photo((done + 1) / len(used))

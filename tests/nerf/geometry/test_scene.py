@@ -77,8 +77,8 @@ def test_json_gives_back_every_bit() -> None:
 
 
 def test_another_version_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"scene.json has version 3, this program reads version 2"):
-        Scene.from_json(scene().to_json() | {"version": 3})
+    with pytest.raises(ValueError, match=r"scene.json has version 4, this program reads version 3"):
+        Scene.from_json(scene().to_json() | {"version": 4})
 
 
 def test_views_of_a_split() -> None:

@@ -79,7 +79,7 @@ def test_the_colour_of_transparent_pixels_does_not_leak(tmp_path: Path) -> None:
         ((400, 400), True, 2, 2),
         ((4000, 3000), False, 2, 2),
         ((4000, 3000), False, 64, 5),
-        ((4000, 3000), True, 64, 1),
+        ((4000, 3000), True, 64, 2),
         ((9000, 8000), True, 8, 1),
     ],
 )

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.io.pixels import CONTRAST_SCALE, even_contrast
+from stages.io.pixels import BYTES_PER_PIXEL, CONTRAST_SCALE, even_contrast
 from stages.train.data import training_dataset
 from tests.conftest import RecordedProgress
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
@@ -28,7 +28,7 @@ def test_parallel_decoding_follows_the_files_sizes(
     asked = list[int]()
     inputs, scene = photographed(tmp_path, channels=4)
     monkeypatch.setattr("stages.io.pixels.processors", lambda: 16)
-    monkeypatch.setattr("stages.io.pixels.DECODING_BYTES", 2 * 80 * WIDTH * HEIGHT)
+    monkeypatch.setattr("stages.io.pixels.DECODING_BYTES", 2 * BYTES_PER_PIXEL[4] * WIDTH * HEIGHT)
     monkeypatch.setattr("stages.io.pixel_store.ThreadPoolExecutor", pool)
     training_dataset(inputs["ingest"], replace(scene, has_alpha=has_alpha), "train", downscale, progress)
     assert asked == [2]

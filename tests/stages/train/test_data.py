@@ -86,6 +86,18 @@ def test_transparent_pixels_are_shown_over_the_background(tmp_path: Path, progre
     assert training_dataset(inputs["ingest"], scene, "train", 1.0, progress).pixels.shape[1] == 4
 
 
+@pytest.mark.parametrize("downscale", [1.0, 2.0, 3.3])
+def test_a_mask_can_be_the_alpha(downscale: float, tmp_path: Path, progress: RecordedProgress) -> None:
+    inputs, scene = photographed(tmp_path / "masks", mask=np.ascontiguousarray(ball_photo(4)[..., 3]))
+    views = tuple(replace(view, mask=None, alpha=view.mask) for view in scene.views)
+    by_mask = training_dataset(
+        inputs["ingest"], replace(scene, has_alpha=True, views=views), "train", downscale, progress
+    )
+    inputs, scene = photographed(tmp_path / "alpha", channels=4)
+    by_photo = training_dataset(inputs["ingest"], scene, "train", downscale, progress)
+    assert by_mask.runs is None and torch.equal(by_mask.pixels, by_photo.pixels)
+
+
 @pytest.mark.parametrize("downscale", [1.0, 2.0])
 def test_ignored_alpha_is_like_a_mask(downscale: float, tmp_path: Path, progress: RecordedProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=4)
@@ -207,7 +219,7 @@ def test_masks_are_loaded_a_few_at_a_time_and_dropped(
     loaded, alive = list[weakref.ref[np.ndarray]](), list[int]()
     inputs, scene = photographed(tmp_path, views=16, mask=half_mask())
     monkeypatch.setattr("stages.train.data.load_mask", load)
-    monkeypatch.setattr("stages.train.data.loaders", lambda files: 2)
+    monkeypatch.setattr("stages.train.data.loaders", lambda files, channels: 2)
     dataset = training_dataset(inputs["ingest"], scene, "train", 1.0, progress)
     assert len(loaded) == 12 and 1 <= max(alive) <= 4
     unmasked_count = dataset.is_unmasked(torch.arange(len(dataset.pixels))).view(12, HEIGHT, WIDTH)
