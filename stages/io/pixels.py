@@ -72,8 +72,9 @@ def load_pixels(path: Path, width: int, height: int, alpha_path: Path | None = N
     four times the size is not decoded whole; its values are nearly those means.
     """
     with pillow().open(path) as image:
-        if quick:
-            image.draft(image.mode, (2 * width, 2 * height))
+        whole = image.size
+        if quick and (drafted := image.draft(image.mode, (2 * width, 2 * height))) and image.size != whole:
+            image = image.resize((width, height), Image.Resampling.BOX, drafted[1])  # sides of a draft are rounded up
         pixels = np.asarray(image)
     if alpha_path is not None:
         with pillow().open(alpha_path) as image:

@@ -28,7 +28,7 @@ class Config(StageConfig):
     masks: Auto[Literal["cut-out", "ignore"]] = Field(
         default=None,
         description=(
-            "What masks ignore is transparent (cut-out) or unknown (ignore) (default: transparent where they cut out "
+            "cut-out: what masks ignore is transparent; ignore: it is unknown (default: transparent where they cut out "
             "an object, as the sparse points tell)."
         ),
     )

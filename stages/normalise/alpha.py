@@ -6,7 +6,7 @@ something, such as people who pass by. From wherever it was taken, a photo shows
 thing's outline, those on its back, too; but points of what is hidden lie among the ignored pixels.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -16,23 +16,27 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf.geometry.normalisation import Normalisation
-from nerf.geometry.scene import Camera
+from nerf.geometry.region_of_interest import CaptureType
 from stages.contract import Progress, listed
+from stages.io.amounts import counted
 from stages.io.photos import Box, Photo, ends_within, spread
 from stages.io.pixels import box_of, loaders, pillow
 from stages.io.sparse_model import SparseImage, SparseModel
-from stages.sfm.colmap.cameras import project
+from stages.sfm.colmap.cameras import border_rays, project
 
 MaskMeaning = Literal["cut-out", "ignore"]
 
 CELLS = 128  # along the longer side of a photo: an outline may be wrong by so much of it
 SAMPLES = 4  # along a side of a cell
+FEW = 24  # masks, evenly spread, that decide for all
+MIN_AREA = 0.25  # that a mask ignores around an object; a wire or a thin border is less
+ALIKE = 0.99  # of what one of two masks leaves, that both do: of a lens, a rig or a border
 MIN_PHOTOS = 3  # that see a point for it to count
-MAX_POINTS = 4000
-FEW = 24  # masks, evenly spread, that decide for all: a large one takes a tenth of a second
-# Of the points that lie in a photo, that a mask which follows an outline may ignore. Of a carved stone masks ignored
-# 0.1 % of them (median of 145 photos) and 2.5 % (95 in 100), the wrong one among them 49 %; of a statue 2.2 % at most.
-MAX_IGNORED = 0.05
+MIN_POINTS, MAX_POINTS = 20, 4000  # that lie in a photo for them to tell; that are looked at
+# Of the points that lie in a photo, that a mask which follows an outline may ignore. Masks of a carved stone ignored
+# 0.1 % of them (median of 145 photos) and 2.5 % (95 in 100), the wrong one among them 49 %; of two statues 2.2 % at
+# most.
+MAX_IGNORED = 0.03
 
 
 class Alpha(NamedTuple):
@@ -48,6 +52,7 @@ def find_alpha(
     photos: Sequence[Photo],
     model: SparseModel,
     order: Sequence[int],
+    capture_type: CaptureType,
     meaning: MaskMeaning | None,
     progress: Progress,
 ) -> Alpha | None:
@@ -55,11 +60,22 @@ def find_alpha(
     nothing says what is background. Photo i is image ``order[i]`` of the model."""
     if _has_alpha(photos, progress, tracked=len(model.view) > 0):
         return Alpha([photo.opaque for photo in photos], [None] * len(photos))
-    if meaning == "ignore" or not any(photo.mask for photo in photos):
+    if meaning == "ignore":
         return None
-    if meaning is None and not (len(model.view) and all(photo.mask for photo in photos)):
+    masks = _Masks(ingest, photos, model, order)
+    if meaning == "cut-out":
+        if not masks.photos or any(photo.has_alpha for photo in photos):
+            why = "some photos have alpha" if masks.photos else "no photo has a mask"
+            progress.note("normalise.masks-not-used", f"--normalise.masks cut-out changes nothing: {why}")
+            return None
+        return masks.as_alpha(forced=True, progress=progress)
+    if not masks.surround_something():
         return None
-    return _cut_out(ingest, photos, model, order, forced=meaning == "cut-out")
+    if why := masks.why_unknown(capture_type):
+        hint = "--normalise.masks cut-out makes it transparent"
+        progress.note("normalise.masks-ignore", f"what masks ignore stays unknown: {why}; {hint}")
+        return None
+    return masks.as_alpha(forced=False, progress=progress)
 
 
 def alpha_or_none(
@@ -70,16 +86,21 @@ def alpha_or_none(
     if not found.bounded:
         left = "what the masks leave" if of_masks else "the opaque parts of the photos"
         where = "the given region" if roi_given else left
-        so = "what masks ignore stays unknown" if of_masks else "transparent parts are ignored like masked ones"
+        unknown = "what masks ignore stays unknown; --normalise.roi can say where the object ends"
+        so = unknown if of_masks else "transparent parts are ignored like masked ones"
         what = f"{found.beyond_alpha:.1%} of the tracked points lie outside {where}"
         code = "normalise.masks-beyond-region" if of_masks else "normalise.alpha-beyond-region"
         progress.note(code, f"{what}: the scene continues there, so {so}")
         return None
     if of_masks:
         others = [photo.name for photo, mask in zip(photos, alpha.masks, strict=True) if photo.mask and not mask]
-        but = f", but for {len(others)} that also hide parts of it ({listed(others, 3)})" if others else ""
-        what = f"the masks cut out an object{but}: what they ignore is transparent"
-        progress.note("normalise.masks-cut-out", f"{what}; --normalise.masks ignore leaves it unknown")
+        without = [photo.name for photo in photos if photo.mask is None]
+        but = f"; masks that also hide parts of it only ignore ({listed(others, 3)})" if others else ""
+        but += f"; photos without a mask count as opaque ({listed(without, 3)})" if without else ""
+        progress.note(
+            "normalise.masks-cut-out",
+            f"the masks cut out an object: what they ignore is transparent, and counts in the scores{but}",
+        )
     return alpha
 
 
@@ -105,37 +126,76 @@ def _has_alpha(photos: Sequence[Photo], progress: Progress, tracked: bool) -> bo
     return has_alpha
 
 
-def _cut_out(
-    ingest: Path, photos: Sequence[Photo], model: SparseModel, order: Sequence[int], forced: bool
-) -> Alpha | None:
-    """What the masks cut out; None where a few of them show that they do not.
+class _Masks:
+    """The masks of those ``photos`` that have one, and whether they follow the outline of what the points show."""
 
-    They do where they are not all alike, as of a part of the camera, where most show what is left from one of its sides
-    to the other, as one sees a thing, and where most follow an outline. The mask of a photo that does not stays a mask.
-    ``forced``: all do.
-    """
-    masked = [(photo, model.images[i]) for photo, i in zip(photos, order, strict=True) if photo.mask]
-    points = _firm_points(model)
+    def __init__(self, ingest: Path, photos: Sequence[Photo], model: SparseModel, order: Sequence[int]) -> None:
+        self.ingest, self.all, self.model = ingest, photos, model
+        self.image = {photo.name: model.images[i] for photo, i in zip(photos, order, strict=True)}
+        self.photos = [photo for photo in photos if photo.mask]
+        seen = np.bincount(model.point, minlength=len(model.xyz)) if len(model.point) else np.zeros(len(model.xyz))
+        firm = model.xyz[seen >= MIN_PHOTOS]
+        self.points = firm[:: -(-len(firm) // MAX_POINTS) or 1]
+        self.narrowest = [float(border_rays(camera)[:, 2].min()) for camera in model.cameras]
+        few = [self.photos[i] for i in spread(len(self.photos), min(len(self.photos), FEW))]
+        self.few = self._looked_at(few, lambda done: None)
 
-    def look(photo: Photo, image: SparseImage) -> _Mask:
-        ignored = _ignored_share(ingest / str(photo.mask))
-        share = _ignored_points(points, image.sfm_from_camera, model.cameras[image.camera], ignored)
-        return _Mask(ignored, box_of(ignored < 0.5), forced or share <= MAX_IGNORED)
+    def surround_something(self) -> bool:
+        """Whether most of a few ignore a good part of their photo on two of its opposite sides, and not all the same
+        part, as around a thing."""
+        around = [mask for mask in self.few if _is_around_something(mask)]
+        return 2 * len(around) > len(self.few) and not _are_alike([mask.ignored for mask in self.few])
 
-    with ThreadPoolExecutor(loaders(ingest / str(photo.mask) for photo, _ in masked)) as pool:
-        if not forced:
-            few = list(pool.map(lambda number: look(*masked[number]), spread(len(masked), min(len(masked), FEW))))
-            alike = all(np.array_equal(mask.ignored, few[0].ignored) for mask in few)
-            framing, follow = sum(ends_within(mask.box) for mask in few), sum(mask.follows for mask in few)
-            if alike or 2 * min(framing, follow) <= len(few):
-                return None
-        names = [photo.name for photo, _ in masked]
-        of = dict(zip(names, pool.map(lambda one: look(*one)[1:], masked), strict=True))
-    boxes = {name: box for name, (box, follows) in of.items() if follows}
-    return Alpha(
-        [boxes.get(photo.name) for photo in photos],
-        [photo.mask if photo.name in boxes else None for photo in photos],
-    )
+    def why_unknown(self, capture_type: CaptureType) -> str | None:
+        """What speaks against masks that surround something cutting out an object, as far as a few tell."""
+        if any(photo.has_alpha for photo in self.all):
+            return "some photos have alpha"
+        if without := len(self.all) - len(self.photos):
+            return f"{without} of {counted(len(self.all), 'photo')} {'has' if without == 1 else 'have'} no mask"
+        if capture_type != "object-centric":
+            return "the photos were not taken around an object"
+        if not len(self.points):
+            return "no points tell whether they hide parts of the object"
+        follow = sum(mask.follows and _is_around_something(mask) for mask in self.few)
+        return None if 2 * follow > len(self.few) else "most of them also hide tracked points"
+
+    def as_alpha(self, forced: bool, progress: Progress) -> Alpha:
+        """The masks as alpha, but for those that do not follow an outline; ``forced``: all of them."""
+
+        def report(done: float) -> None:
+            progress.update("looking at the masks", done)
+
+        of = dict(zip((photo.name for photo in self.photos), self._looked_at(self.photos, report), strict=True))
+        boxes = {name: mask.box for name, mask in of.items() if forced or mask.follows}
+        return Alpha(
+            [boxes.get(photo.name) for photo in self.all],
+            [photo.mask if photo.name in boxes else None for photo in self.all],
+        )
+
+    def _looked_at(self, photos: Sequence[Photo], report: Callable[[float], None]) -> list["_Mask"]:
+        found = list[_Mask]()
+        files = [self.ingest / photo.mask for photo in photos if photo.mask]
+        with ThreadPoolExecutor(loaders(files)) as pool:
+            for photo, ignored in zip(photos, pool.map(_ignored_share, files), strict=True):
+                share = self._ignored_points(self.image[photo.name], ignored)
+                found.append(_Mask(ignored, box_of(ignored < 0.5), share <= MAX_IGNORED))
+                report(len(found) / len(photos))
+        return found
+
+    def _ignored_points(self, image: SparseImage, ignored: Float[np.ndarray, "rows columns"]) -> float:
+        """Of the points that lie in a photo, hidden ones too, the share in cells that its mask ignores whole; 1 where
+        too few lie there. Distortion folds back far outside of a photo: points beyond its corners are left out."""
+        camera, pose = self.model.cameras[image.camera], image.sfm_from_camera
+        local = (self.points - pose[:, 3]) @ pose[:, :3]
+        narrowest = max(self.narrowest[image.camera], 0.0)
+        ahead = (local[:, 2] > 0) & (local[:, 2] >= narrowest * np.linalg.norm(local, axis=1))
+        pixels, size = project(camera, local[ahead]), np.array([camera.width, camera.height])
+        inside = ((pixels >= 0) & (pixels < size)).all(axis=1)  # NaN is not
+        if inside.sum() < MIN_POINTS:
+            return 1.0
+        rows, columns = ignored.shape
+        column, row = np.minimum((pixels[inside] / size * [columns, rows]).astype(int), [columns - 1, rows - 1]).T
+        return float((ignored[row, column] == 1).mean())
 
 
 class _Mask(NamedTuple):
@@ -144,6 +204,17 @@ class _Mask(NamedTuple):
     ignored: Float[np.ndarray, "rows columns"]
     box: Box | None
     follows: bool
+
+
+def _is_around_something(mask: _Mask) -> bool:
+    return mask.box is not None and ends_within(mask.box) and float(mask.ignored.mean()) >= MIN_AREA
+
+
+def _are_alike(ignored: Sequence[Float[np.ndarray, "rows columns"]]) -> bool:
+    """Whether all those of a shape leave nearly the same."""
+    first = {one.shape: 1 - one for one in reversed(ignored)}
+    together = [(1 - one, first[one.shape]) for one in ignored]
+    return all(np.minimum(*pair).sum() >= ALIKE * np.maximum(*pair).sum() for pair in together)
 
 
 def _ignored_share(file: Path) -> Float[np.ndarray, "rows columns"]:
@@ -155,28 +226,3 @@ def _ignored_share(file: Path) -> Float[np.ndarray, "rows columns"]:
     scale = min(1.0, CELLS / max(ignored.shape))
     width, height = (max(1, round(side * scale)) for side in ignored.shape[::-1])
     return cv2.resize(ignored, (width, height), interpolation=cv2.INTER_AREA)
-
-
-def _firm_points(model: SparseModel) -> Float[np.ndarray, "n 3"]:
-    """Points that MIN_PHOTOS photos see, at most MAX_POINTS of them."""
-    firm = model.xyz[np.bincount(model.point, minlength=len(model.xyz)) >= MIN_PHOTOS]
-    return firm[:: -(-len(firm) // MAX_POINTS) or 1]
-
-
-def _ignored_points(
-    points: Float[np.ndarray, "n 3"],
-    pose: Float[np.ndarray, "3 4"],
-    camera: Camera,
-    ignored: Float[np.ndarray, "rows columns"],
-) -> float:
-    """Of the points that lie in a photo, hidden ones too, the share in cells that its mask ignores whole; 1 where none
-    lies there."""
-    local = (points - pose[:, 3]) @ pose[:, :3]
-    pixels = project(camera, local[local[:, 2] > 0])
-    size = np.array([camera.width, camera.height])
-    inside = ((pixels >= 0) & (pixels < size)).all(axis=1)  # NaN is not
-    if not inside.any():
-        return 1.0
-    rows, columns = ignored.shape
-    column, row = np.minimum((pixels[inside] / size * [columns, rows]).astype(int), [columns - 1, rows - 1]).T
-    return float((ignored[row, column] == 1).mean())

@@ -10,6 +10,7 @@ import numpy as np
 from nerf import REGION_HALF_SIZE
 from nerf.geometry.normalisation import Normalisation, normalise
 from nerf.geometry.reconstruction import Reconstruction, angles, extent
+from nerf.geometry.region_of_interest import find_capture_type
 from nerf.geometry.scene import Camera, Scene, Split, View
 from nerf.geometry.up_vector import Witness, up_by_places
 from stages.contract import Inputs, Progress, StageError, StageResult
@@ -42,13 +43,15 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
         ((by_file[f"images/{image.file}"], i) for i, image in enumerate(model.images)), key=lambda pair: pair[0].name
     )
     photos, order = [photo for photo, _ in posed], [i for _, i in posed]
-    alpha = find_alpha(inputs["ingest"], photos, model, order, config.masks, progress)
+    sfm = _reconstruction(model, order, None)
+    alpha = find_alpha(inputs["ingest"], photos, model, order, find_capture_type(sfm), config.masks, progress)
     registration = read_json(inputs["sfm"] / "registration.json")
     official = registration["test_files"]
     split = split_photos(photos, config.test_every, official)
     # What is opaque in a test photo decides nothing.
-    boxes = alpha and [box if part == "train" else None for box, part in zip(alpha.opaque, split, strict=True)]
-    sfm = _reconstruction(model, order, boxes)
+    if alpha is not None:
+        boxes = [box if part == "train" else None for box, part in zip(alpha.opaque, split, strict=True)]
+        sfm = _reconstruction(model, order, boxes)
     try:
         found = normalise(sfm, config.roi, _up_by_gps(registration["georeference"], sfm, photos))
     except ValueError as error:

@@ -19,7 +19,7 @@ from stages.effects.decisions import Space, read_decisions
 from stages.hardware.device import processors
 from stages.io.amounts import resolution_name
 from stages.io.ascii_names import shell_quoted
-from stages.io.pixels import load_pixels
+from stages.io.pixels import load_view
 from stages.train.config import FieldName
 from stages.train.data import scaled_size
 from stages.train.fields import hash_grid
@@ -396,7 +396,7 @@ def measure_reading(scene: Scene, ingest: Path) -> ReadingTime:
     test, started = scene.of_split("test"), 0.0
     for view in (test[-1], test[0]):  # the first one pays for imports
         started = time.perf_counter()
-        load_pixels(ingest / view.file, *scaled_size(scene.cameras[view.camera], 2.0))
+        load_view(ingest, view, *scaled_size(scene.cameras[view.camera], 2.0))
     per_pixel = (time.perf_counter() - started) / pixels(test[:1])
     return ReadingTime(per_pixel * pixels(scene.views) / processors(), per_pixel * pixels(test))
 

@@ -72,7 +72,7 @@ def training_dataset(
     be. What masks ignore is never drawn. Raises StageError, ALL_MASKED, where they leave nothing."""
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
     at_once = cache(
-        lambda: loaders((ingest / view.file for view in views), channels=4 * scene.has_alpha)
+        lambda: loaders((ingest / view.file for view in views), channels=4 * any(view.alpha for view in views))
     )  # opens every file
     fill(store, lambda index: _decoded_pixels(ingest, scene, views[index], downscale), at_once, progress)
     used = sorted({view.camera for view in views})

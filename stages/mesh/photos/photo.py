@@ -4,6 +4,7 @@ Colours are sRGB in [0, 1] at the reference exposure: what the photo's exposure 
 linear light (nerf/effects), as in new views of the field. Pixels are (x, y) of the photo's own size.
 """
 
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ from nerf.geometry.scene import Camera, Scene, View
 from stages.contract import StageError
 from stages.effects.image_effects import new_view_effects, photo_effects
 from stages.io.photos import read_photos
-from stages.io.pixels import OPAQUE_FROM, load_mask, load_pixels
+from stages.io.pixels import OPAQUE_FROM, load_mask, load_pixels, loaders
 from stages.sfm.colmap.cameras import border_rays, mean_focal_and_centre, project
 
 REMAP_SIDE = 1 << 14  # points that OpenCV takes in a row
@@ -106,15 +107,25 @@ def read_picture(photo: Photo, downscale: float) -> Picture:
         pixels = load_pixels(photo.folder / photo.view.file, width, height, quick=True)
     except OSError as error:
         raise _unreadable(photo, error) from error
-    used = np.ones((height, width), np.uint8)
-    for mask in (photo.view.mask, photo.view.alpha):
-        if mask is not None:
-            used &= _mask(photo, mask, width, height)
-    if photo.has_alpha and pixels.shape[2] == 4:
-        opaque = (pixels[..., 3] >= OPAQUE_FROM).astype(np.uint8)
-        inside = cv2.erode(opaque, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    mask = None if photo.view.mask is None else _mask(photo, photo.view.mask, width, height)
+    used = np.ones((height, width), np.uint8) if mask is None else mask.astype(np.uint8)
+    opaque = None
+    if photo.view.alpha is not None:
+        opaque = _mask(photo, photo.view.alpha, width, height)
+    elif photo.has_alpha and pixels.shape[2] == 4:
+        opaque = pixels[..., 3] >= OPAQUE_FROM
+    if opaque is not None:
+        inside = cv2.erode(opaque.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
         used = np.minimum(used, np.asarray(inside, np.uint8))
     return Picture(np.ascontiguousarray(pixels[..., :3]), used)
+
+
+def readers(photos: Sequence[Photo]) -> int:
+    """How many of these photos to read at a time; one where a file is gone, as reading it then says."""
+    try:
+        return loaders(photo.folder / photo.view.file for photo in photos)
+    except OSError:
+        return 1
 
 
 def unmasked(photo: Photo, place: Projection) -> np.ndarray:

@@ -18,8 +18,7 @@ import torch
 from scipy.sparse import csr_array
 
 from nerf.runtime.parallel import in_order
-from stages.io.pixels import loaders
-from stages.mesh.photos.photo import Photo, Picture, colours_at, projected, read_picture
+from stages.mesh.photos.photo import Photo, Picture, colours_at, projected, read_picture, readers
 from stages.mesh.rasteriser import barycentric, covered_pixels
 from stages.mesh.surface import Surface
 from stages.mesh.texture.atlas import Atlas
@@ -51,7 +50,7 @@ def bake(
 
     # The next photos are decoded on threads of their own while the cores bake this one.
     used = [index for index in range(len(photos)) if len(choice.weights[index][0])]
-    count = loaders(photos[index].folder / photos[index].view.file for index in used)
+    count = readers([photos[index] for index in used])
     with ThreadPoolExecutor(count) as ahead:
         read = partial(read_picture, downscale=max(1.0, 1 / atlas.texels_per_pixel))
         upcoming = deque(ahead.submit(read, photos[index]) for index in used[:count])

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
-from stages.io.pixels import BYTES_PER_PIXEL, CONTRAST_SCALE, even_contrast
+from stages.io.pixels import BYTES_PER_PIXEL, CONTRAST_SCALE, even_contrast, load_pixels
 from stages.train.data import training_dataset
 from tests.conftest import RecordedProgress
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
@@ -50,3 +51,11 @@ def test_even_contrast_is_that_of_any_light(gain: float, offset: int, seed: int)
 def test_noise_stays_faint_where_contrast_is_even() -> None:
     noise = np.random.default_rng(0).integers(100, 102, (90, 120)).astype(np.uint8)
     assert even_contrast(noise, nearby, 3.0).std() < CONTRAST_SCALE / 4
+
+
+@pytest.mark.parametrize("size", [(400, 304), (401, 301)])
+def test_a_quick_reduction_is_nearly_the_mean(tmp_path: Path, size: tuple[int, int]) -> None:
+    coarse = np.random.default_rng(0).integers(0, 256, (9, 11, 3), np.uint8)
+    Image.fromarray(coarse).resize(size, Image.Resampling.BICUBIC).save(tmp_path / "a.jpg", quality=95)
+    whole, quick = (load_pixels(tmp_path / "a.jpg", 50, 38, quick=each).astype(float) for each in (False, True))
+    assert 0 < np.sqrt(((quick - whole) ** 2).mean()) < 1

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from nerf.geometry.region_of_interest import CaptureType
 from nerf.geometry.scene import Camera
 from stages.io.files import write_png
 from stages.io.photos import Photo
@@ -29,7 +30,13 @@ LENS = np.uint8(255) * (np.hypot(*(np.mgrid[:SIDE, :SIDE] - SIDE / 2)) < SIDE / 
 def outlined(tmp_path: Path, progress: RecordedProgress):
     """What is found where each of a ring of photos has a mask around a ball of points, which ``paint`` changes."""
 
-    def find(paint: Paint = lambda number, mask: None, unmasked: int = 0, meaning: MaskMeaning | None = None) -> Any:
+    def find(
+        paint: Paint = lambda number, mask: None,
+        unmasked: int = 0,
+        meaning: MaskMeaning | None = None,
+        capture_type: CaptureType = "object-centric",
+        has_alpha: int = 0,
+    ) -> Any:
         poses = ring(PHOTOS)
         scene = seen_by(poses, ball())
         photos = []
@@ -42,13 +49,14 @@ def outlined(tmp_path: Path, progress: RecordedProgress):
             file = f"masks/{number:02d}.png"
             (tmp_path / "masks").mkdir(exist_ok=True)
             write_png(tmp_path / file, mask)
-            photo = Photo(f"{number:02d}.jpg", f"images/{number:02d}.jpg", SIDE, SIDE, 0, None, None, False, 1.0)
+            alpha = number < has_alpha
+            photo = Photo(f"{number:02d}.jpg", f"images/{number:02d}.jpg", SIDE, SIDE, 0, None, None, alpha, 1.0)
             photos.append(replace(photo, mask=file if number >= unmasked else None))
         images = [SimpleNamespace(camera=0, sfm_from_camera=pose) for pose in poses]
         model: Any = SimpleNamespace(
             cameras=[CAMERA], images=images, xyz=scene.points, view=scene.view, point=scene.point
         )
-        return find_alpha(tmp_path, photos, model, range(PHOTOS), meaning, progress)
+        return find_alpha(tmp_path, photos, model, range(PHOTOS), capture_type, meaning, progress)
 
     return find
 
@@ -69,26 +77,45 @@ def test_a_mask_that_hides_part_of_it_stays_one(outlined) -> None:
     assert found.opaque[5] is None
 
 
+def speck(number: int, mask: np.ndarray) -> None:
+    mask.fill(255)
+    mask[20 * number, 100:103] = 0
+
+
+def lens(number: int, mask: np.ndarray) -> None:
+    np.copyto(mask, LENS)
+    mask[0, : 4 * number] = 255
+
+
 @pytest.mark.parametrize(
-    "paint",
+    ("paint", "codes"),
     [
-        hide_middle,
-        lambda number, mask: np.copyto(mask, PASSER_BY[number % 10]),
-        lambda number, mask: np.copyto(mask, LENS),
-        lambda number, mask: mask[:, 100:].fill(255),  # nothing but a sky on one side is ignored
-        lambda number, mask: mask.fill(0),
+        (hide_middle, ["normalise.masks-ignore"]),
+        (lambda number, mask: np.copyto(mask, PASSER_BY[number % 10]), []),
+        (lens, []),
+        (lambda number, mask: mask[:, 100:].fill(255), []),  # nothing but a sky on one side is ignored
+        (speck, []),
+        (lambda number, mask: mask.fill(0), []),
     ],
-    ids=["hides", "passer-by", "lens", "side", "all"],
+    ids=["hides", "passer-by", "lens", "side", "speck", "all"],
 )
-def test_other_masks_only_ignore(outlined, paint: Paint) -> None:
+def test_other_masks_only_ignore(outlined, progress: RecordedProgress, paint: Paint, codes: list[str]) -> None:
     assert outlined(paint) is None
+    assert progress.codes == codes
 
 
-def test_one_photo_without_a_mask_shows_background(outlined) -> None:
+def test_what_speaks_against_a_cut_out_is_said(outlined, progress: RecordedProgress) -> None:
     assert outlined(unmasked=1) is None
+    assert outlined(capture_type="forward-facing") is None
+    assert outlined(has_alpha=2) is None
+    assert [code for code in progress.codes if "masks" in code] == ["normalise.masks-ignore"] * 3
+    assert "1 of 17 photos has no mask" in progress.notes[0]
 
 
-def test_what_masks_mean_can_be_said(outlined) -> None:
+def test_what_masks_mean_can_be_said(outlined, progress: RecordedProgress) -> None:
     assert outlined(meaning="ignore") is None
-    found: Alpha = outlined(hide_middle, unmasked=2, meaning="cut-out")
+    found: Alpha = outlined(hide_middle, unmasked=2, meaning="cut-out", capture_type="inside-out")
     assert [mask is None for mask in found.masks] == [number < 2 for number in range(PHOTOS)]
+    assert progress.codes == []
+    assert outlined(unmasked=PHOTOS, meaning="cut-out") is None
+    assert progress.codes == ["normalise.masks-not-used"]

@@ -3,13 +3,14 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
 from nerf.geometry.camera_paths import nearest_rotations
 from nerf.geometry.scene import Camera
 from stages import normalise
-from stages.io.files import read_json, read_scene, read_tensors
+from stages.io.files import read_json, read_scene, read_tensors, write_png
 from stages.io.photos import Box, Photo, read_photos, write_photos
 from stages.normalise.scene_frame import _within
 from stages.normalise.split import split_photos
@@ -169,6 +170,27 @@ def test_alpha_is_the_background_of_a_whole_object(inputs, progress, opaque: Box
     folders = inputs(transparent=17, opaque=opaque)
     run(folders, progress)
     assert read_scene(folders["normalise"]).has_alpha and progress.notes == []
+
+
+def test_masks_around_an_object_become_its_alpha(inputs, progress) -> None:
+    folders = inputs()
+    masked = [replace(photo, mask=f"masks/{i:02d}.png") for i, photo in enumerate(read_photos(folders["ingest"]))]
+    (folders["ingest"] / "masks").mkdir()
+    for i, photo in enumerate(masked):
+        mask = np.zeros((400, 400), np.uint8)
+        cv2.circle(mask, (200, 200), 125 + i, 255, -1)
+        write_png(folders["ingest"] / str(photo.mask), mask)
+    write_photos(folders["ingest"], masked, [], {})
+    run(folders, progress)
+    scene = read_scene(folders["normalise"])
+    assert scene.has_alpha and scene.bounded and progress.codes == ["normalise.masks-cut-out"]
+    assert [(view.mask, view.alpha) for view in scene.views] == [(None, photo.mask) for photo in masked]
+    frames = read_json(folders["normalise"] / "transforms.json")["frames"]
+    assert [frame["mask_path"] for frame in frames] == [photo.mask for photo in masked]
+    run(folders, progress, masks="ignore")
+    scene = read_scene(folders["normalise"])
+    assert not scene.has_alpha and not scene.bounded
+    assert [(view.mask, view.alpha) for view in scene.views] == [(photo.mask, None) for photo in masked]
 
 
 def test_where_nothing_is_tracked_alpha_is_the_background(inputs, progress, monkeypatch: pytest.MonkeyPatch) -> None:
