@@ -68,13 +68,12 @@ def load_pixels(path: Path, width: int, height: int, alpha_path: Path | None = N
     can be its alpha.
 
     The means are taken of sRGB values weighted by alpha (premultiplied); a pixel that nothing covers is black.
-    At the image's own size the values are those stored. Enlarging interpolates linearly. ``quick``: a JPEG of at least
-    four times the size is not decoded whole; its values are nearly those means.
+    At the image's own size the values are those stored. Enlarging interpolates linearly. ``quick``: a JPEG of four
+    times the size or more may not be decoded whole; its values are nearly those means.
     """
     with pillow().open(path) as image:
-        whole = image.size
-        if quick and (drafted := image.draft(image.mode, (2 * width, 2 * height))) and image.size != whole:
-            image = image.resize((width, height), Image.Resampling.BOX, drafted[1])  # sides of a draft are rounded up
+        if quick:
+            image.draft(image.mode, _draft_size(image.width, image.height, 2 * width, 2 * height))
         pixels = np.asarray(image)
     if alpha_path is not None:
         with pillow().open(alpha_path) as image:
@@ -90,6 +89,15 @@ def load_pixels(path: Path, width: int, height: int, alpha_path: Path | None = N
     covered = resized[..., 3:] > 0
     colour = np.divide(resized[..., :3], resized[..., 3:], out=np.zeros_like(resized[..., :3]), where=covered)
     return np.rint(np.concatenate([colour, resized[..., 3:]], axis=2)).astype(np.uint8)
+
+
+def _draft_size(width: int, height: int, min_width: int, min_height: int) -> tuple[int, int]:
+    """The size at which a JPEG can be decoded: a half, a quarter or an eighth of it, where nothing is left over, else
+    the whole."""
+    for scale in (8, 4, 2):
+        if width % scale == height % scale == 0 and width >= scale * min_width and height >= scale * min_height:
+            return width // scale, height // scale
+    return width, height
 
 
 def even_contrast(
