@@ -31,6 +31,7 @@ ELSEWHERE = {
     "divided by it: tests/nerf/training/test_ray_dataset.py",
     "nerf/rendering/srgb.py": "the standard's own curve, its inverse, from nothing to 1e30: "
     "tests/nerf/rendering/test_srgb.py",
+    "nerf/rendering/srgb_arrays.py": "the same in float64: tests/nerf/rendering/test_srgb.py",
     "nerf/effects/exposure.py": "from one power law to the other, without linear light in between; value, "
     "gradient, extremes: "
     "tests/nerf/effects/test_exposure.py",
