@@ -75,9 +75,9 @@ class Scene:
     """Everything that training and rendering need to know of the geometry.
 
     ``bounded``: all that the photos show lies inside the region of interest; otherwise space beyond it is contracted
-    (nerf/geometry/space_maps/contraction.py). ``has_alpha``: the photos' alpha, or masks in its
-    place, says what is background.
-    ``capture_type``: cameras around an object, cameras that look outward or through a room, or all facing one way.
+    (nerf/geometry/space_maps/contraction.py). ``has_alpha``: the photos' alpha, or masks in its place, says what is
+    background. ``capture_type``: cameras around an object, cameras that look outward or through a room, or all facing
+    one way.
     """
 
     cameras: tuple[Camera, ...]

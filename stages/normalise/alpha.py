@@ -137,8 +137,10 @@ class _Masks:
         firm = model.xyz[seen >= MIN_PHOTOS]
         self.points = firm[:: -(-len(firm) // MAX_POINTS) or 1]
         self.narrowest = [float(border_rays(camera)[:, 2].min()) for camera in model.cameras]
+        self.looked_at = dict[str, _Mask]()  # by the names of their photos
         few = [self.photos[i] for i in spread(len(self.photos), min(len(self.photos), FEW))]
-        self.few = self._looked_at(few, lambda done: None)
+        self._look_at(few, lambda done: None)
+        self.few = [*self.looked_at.values()]
 
     def surround_something(self) -> bool:
         """Whether most of a few ignore a good part of their photo on two of its opposite sides, and not all the same
@@ -165,22 +167,22 @@ class _Masks:
         def report(done: float) -> None:
             progress.update("looking at the masks", done)
 
-        of = dict(zip((photo.name for photo in self.photos), self._looked_at(self.photos, report), strict=True))
-        boxes = {name: mask.box for name, mask in of.items() if forced or mask.follows}
+        self._look_at(self.photos, report)
+        boxes = {name: mask.box for name, mask in self.looked_at.items() if forced or mask.follows}
         return Alpha(
             [boxes.get(photo.name) for photo in self.all],
             [photo.mask if photo.name in boxes else None for photo in self.all],
         )
 
-    def _looked_at(self, photos: Sequence[Photo], report: Callable[[float], None]) -> list["_Mask"]:
-        found = list[_Mask]()
-        files = [self.ingest / photo.mask for photo in photos if photo.mask]
+    def _look_at(self, photos: Sequence[Photo], report: Callable[[float], None]) -> None:
+        """Look at the masks of ``photos`` that have not been looked at."""
+        rest = [photo for photo in photos if photo.name not in self.looked_at]
+        files = [self.ingest / photo.mask for photo in rest if photo.mask]
         with ThreadPoolExecutor(loaders(files)) as pool:
-            for photo, ignored in zip(photos, pool.map(_ignored_share, files), strict=True):
+            for photo, ignored in zip(rest, pool.map(_ignored_share, files), strict=True):
                 share = self._ignored_points(self.image[photo.name], ignored)
-                found.append(_Mask(ignored, box_of(ignored < 0.5), share <= MAX_IGNORED))
-                report(len(found) / len(photos))
-        return found
+                self.looked_at[photo.name] = _Mask(ignored, box_of(ignored < 0.5), share <= MAX_IGNORED)
+                report(len(self.looked_at) / len(photos))
 
     def _ignored_points(self, image: SparseImage, ignored: Float[np.ndarray, "rows columns"]) -> float:
         """Of the points that lie in a photo, hidden ones too, the share in cells that its mask ignores whole; 1 where

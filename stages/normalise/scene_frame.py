@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +44,7 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
         ((by_file[f"images/{image.file}"], i) for i, image in enumerate(model.images)), key=lambda pair: pair[0].name
     )
     photos, order = [photo for photo, _ in posed], [i for _, i in posed]
-    sfm = _reconstruction(model, order, None)
+    sfm = _reconstruction(model, order)
     alpha = find_alpha(inputs["ingest"], photos, model, order, find_capture_type(sfm), config.masks, progress)
     registration = read_json(inputs["sfm"] / "registration.json")
     official = registration["test_files"]
@@ -51,7 +52,7 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
     # What is opaque in a test photo decides nothing.
     if alpha is not None:
         boxes = [box if part == "train" else None for box, part in zip(alpha.opaque, split, strict=True)]
-        sfm = _reconstruction(model, order, boxes)
+        sfm = replace(sfm, opaque=_opaque(model, order, boxes))
     try:
         found = normalise(sfm, config.roi, _up_by_gps(registration["georeference"], sfm, photos))
     except ValueError as error:
@@ -101,26 +102,27 @@ def _check(config: "Config", views: int) -> None:
         )
 
 
-def _reconstruction(model: SparseModel, order: list[int], boxes: Sequence[Box | None] | None) -> Reconstruction:
-    """The sparse model as plain geometry, its photos in ``order``. ``boxes`` hold what is opaque of each, None where
-    all of it may be; None without alpha."""
-
-    def rays(side: int) -> list[np.ndarray]:
-        of_cameras = [camera_rays(camera, side, side).astype(float) for camera in model.cameras]
-        return [of_cameras[model.images[i].camera] for i in order]
-
-    opaque = None
-    if boxes is not None:
-        parts = [_within(grid, box) for grid, box in zip(rays(OPAQUE_SAMPLES), boxes, strict=True)]
-        opaque = np.stack([extent(angles(part)) for part in parts])
+def _reconstruction(model: SparseModel, order: list[int]) -> Reconstruction:
+    """The sparse model as plain geometry, its photos in ``order``."""
     return Reconstruction(
         from_camera=np.stack([model.images[i].sfm_from_camera for i in order]),
-        ray_directions=np.stack([grid.reshape(-1, 3) for grid in rays(FRUSTUM_SAMPLES)]),
+        ray_directions=np.stack([grid.reshape(-1, 3) for grid in _rays(model, order, FRUSTUM_SAMPLES)]),
         points=model.xyz,
         view=np.argsort(order)[model.view],
         point=model.point,
-        opaque=opaque,
     )
+
+
+def _opaque(model: SparseModel, order: list[int], boxes: Sequence[Box | None]) -> np.ndarray:
+    """What may be opaque in each photo, as in a Reconstruction: ``boxes`` hold it, None where all of it may be."""
+    parts = [_within(grid, box) for grid, box in zip(_rays(model, order, OPAQUE_SAMPLES), boxes, strict=True)]
+    return np.stack([extent(angles(part)) for part in parts])
+
+
+def _rays(model: SparseModel, order: list[int], side: int) -> list[np.ndarray]:
+    """Ray directions of each photo, (side, side, 3)."""
+    of_cameras = [camera_rays(camera, side, side).astype(float) for camera in model.cameras]
+    return [of_cameras[model.images[i].camera] for i in order]
 
 
 def _up_by_gps(georeference: dict[str, Any] | None, sfm: Reconstruction, photos: list[Photo]) -> Witness | None:

@@ -71,9 +71,8 @@ def training_dataset(
     """All pixels and rays of one split, on the CPU; the pixels are mapped from the pixel store, which is made if need
     be. What masks ignore is never drawn. Raises StageError, ALL_MASKED, where they leave nothing."""
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
-    at_once = cache(
-        lambda: loaders((ingest / view.file for view in views), channels=4 * any(view.alpha for view in views))
-    )  # opens every file
+    channels = 4 if any(view.alpha for view in views) else 0
+    at_once = cache(lambda: loaders((ingest / view.file for view in views), channels=channels))  # opens every file
     fill(store, lambda index: _decoded_pixels(ingest, scene, views[index], downscale), at_once, progress)
     used = sorted({view.camera for view in views})
 
