@@ -66,7 +66,7 @@ def _import_cameras(cameras: Path, photos: list, folder: Path) -> None:
     write_imported_model(cameras, AS_DECLARED, photos, folder, folder / "sfm", SilentDisplay())
     model = read_model(folder / "sfm" / "sparse")
     try:
-        found = normalise(_reconstruction(model, list(range(len(model.images))), None), None)
+        found = normalise(_reconstruction(model, list(range(len(model.images)))), None)
     except ValueError as error:
         raise StageError("normalise.no-scale", "the scene has no scale", str(error), "-") from error
     assert (found.near > 0).all() and (found.near < found.far).all() and np.isfinite(found.far).all()
