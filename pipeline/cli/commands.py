@@ -292,7 +292,7 @@ def _run_stages(
     with Workspace(root) as workspace, cluster.joined(common.cluster, [root]):
         runner = Runner(workspace, settings, display)
         if new_budget is not None:
-            runner.set_budget(*new_budget)
+            runner.budget.set_total(*new_budget)
         replan = (stages if alone is None else (alone,)) if common.replan else ()
         again = force | (runner.run_file.plans.keys() & replan)
         forecast = runner.forecast(stages, again)
@@ -304,8 +304,8 @@ def _run_stages(
             display.failed(failure.stage, failure.error)
             raise
         words = _closing_words(workspace, ran)
-        if runner.charged and alone is None and runner.budget:
-            words = f"{duration(runner.budget.seconds_spent)} of {duration(runner.budget.total)} spent {words}"
+        if runner.budget.charged and alone is None and (account := runner.budget.account):
+            words = f"{duration(account.seconds_spent)} of {duration(account.total)} spent {words}"
         display.finished(words, _outputs(workspace))
     return 0
 

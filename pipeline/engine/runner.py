@@ -1,6 +1,5 @@
 """Runs stages: finds what is already there, plans what was left open, runs the rest, finishes it durably."""
 
-import os
 import shutil
 import time
 from collections.abc import Collection, Mapping, Sequence
@@ -8,27 +7,21 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pipeline.engine import machine, manifests, run_file
+from pipeline.engine import machine, manifests
 from pipeline.engine.display import Display
 from pipeline.engine.failures import StageFailed, recorded, worded
 from pipeline.engine.job import DamagedInputs, Job, NotReady
-from pipeline.engine.keys import ContentIndex, config_for_key, digest, stage_key
+from pipeline.engine.keys import digest, stage_key
 from pipeline.engine.manifests import BadManifest, Manifest
+from pipeline.engine.run_budget import RunBudget
+from pipeline.engine.run_digests import RunDigests
 from pipeline.engine.settings import Settings
 from pipeline.engine.stage_list import SOURCE, STAGES, command_that_makes, needed_for
 from pipeline.engine.workspace import Workspace
-from pipeline.schedule.budget import RUNNING, Account
-from pipeline.schedule.forecast import (
-    Forecast,
-    Left,
-    forecast_run,
-    limited_seconds,
-    photos_of,
-    time_behind_plan,
-)
+from pipeline.schedule.budget import RUNNING
+from pipeline.schedule.forecast import Forecast, forecast_run, limited_seconds, photos_of, time_behind_plan
 from stages.contract import StageConfig, StageError, Workload, plan_stage, reading_seconds
 from stages.hardware.device import processors
-from stages.ingest.sources import find_source, is_gone
 from stages.io.photos import read_photos
 from stages.io.stopwatch import counting, elapsed, write_elapsed
 
@@ -43,24 +36,16 @@ class Runner:
         self.force: frozenset[str] = frozenset()
         self.run_file = workspace.read_run()
         self.run_file.options = settings.model_dump(mode="json")
-        self.index = ContentIndex(workspace.root / ".content.json")
+        self.digests = RunDigests(workspace, self.run_file, STAGES, self.options[SOURCE], display)
+        self.budget = RunBudget(workspace, self.run_file, self.digests, STAGES, self.options)
         self.done: dict[str, Manifest] = {}
         self.stages: list[str] = []
         self.times: Mapping[str, float | None] = {}
         self.planning: dict[str, float] = {}  # seconds that it took, where it was done by this program
-        self.detached: Account | None = None  # of a stage alone, after a whole run that has its own
-        self.works_on: str | None = None
-        self.charged = False  # whether any work of this program has cost time of the budget
         self.started: dict[str, float] = {}  # when each stage did, later by what an input cost that was rebuilt
-        self.photos: str | None = None  # their digest: they are listed once
         self.checked: set[str] = set()  # stages whose files were written or read anew by this program
         self.running = ""
         self.verify = False
-
-    @property
-    def budget(self) -> Account | None:
-        """The time that the run may take in all, where there is a limit."""
-        return self.detached or self.run_file.budget
 
     @property
     def options(self) -> dict[str, Any]:
@@ -70,18 +55,6 @@ class Runner:
     def _inputs(self, stage: str) -> tuple[str, ...]:
         """The stages that ``stage`` reads under the options of this run."""
         return STAGES[stage].inputs_of(self.options[stage])
-
-    def set_budget(self, total: float | None, before: float) -> None:
-        """Make ``total`` seconds the budget of this workspace, None for no limit. The same as before goes on.
-
-        ``before``: seconds spent already on what the photos were made in.
-        """
-        if total is None:
-            self.run_file.budget = None
-        elif self.budget is None or self.budget.total != total:
-            self.run_file.budget = Account(total=total, run=self._options_digest())
-            if before:
-                self.run_file.budget.end("photos", before)
 
     def forecast(self, stages: Sequence[str], again: Collection[str]) -> Forecast:
         """How long a run of ``stages`` takes, ``again`` those of them that may run though they have a result. Nothing
@@ -103,16 +76,10 @@ class Runner:
                 except (FileNotFoundError, BadManifest):
                     return None
 
-            left = self.budget and Left(self.budget.total, self._time_left(self.budget))
-            return forecast_run(STAGES, to_run, Workload(photos, processors(), self.options, facts), left)
+            workload = Workload(photos, processors(), self.options, facts)
+            return forecast_run(STAGES, to_run, workload, self.budget.left())
         except StageError:
             return Forecast([], {})
-
-    def _time_left(self, budget: Account) -> float:
-        """Seconds of the budget that this run has: all, unless it goes on with an interrupted one."""
-        budget.recover(self.workspace.root)
-        goes_on = budget.seconds_spent and budget.is_of(self._options_digest(), self._photos_digest())
-        return budget.left if goes_on else budget.total
 
     def found(self, stage: str) -> Manifest | None:
         """The finished result of ``stage`` for these options, as far as can be told beforehand; None without one."""
@@ -120,11 +87,6 @@ class Runner:
             return self._upstream(stage, needed=False) if self.run_file.keys else None
         finally:
             self.done.clear()  # what runs now may make it outdated
-
-    def _options_digest(self) -> str:
-        """Of what a budget is kept for: a study has its own time."""
-        recorded = run_file.portable(self.run_file.options, self.workspace.root)
-        return digest({name: recorded[name] for name, stage in STAGES.items() if not stage.on_request})
 
     def run(
         self,
@@ -145,10 +107,7 @@ class Runner:
         the run, unless all later ones can go without it: then it is raised when these are done.
         """
         self.verify, self.force, self.stages, self.times = verify, force, list(stages), times or {}
-        if self.budget:
-            self.budget.recover(self.workspace.root)
-            if self.budget.over and not remember:
-                self.detached = Account(total=self.budget.total, run=self._options_digest())
+        self.budget.open(whole_run=remember)
         for stage in replan:
             self.run_file.plans.pop(stage, None)
         if remember:
@@ -160,13 +119,13 @@ class Runner:
         except Exception as problem:
             self._unlink_outdated()
             if isinstance(problem, StageFailed):
-                self._close_account(remember)
+                self.budget.close(whole_run=remember)
             raise
         except BaseException:  # a signal: whoever sent it does not wait for photos to be read
             self._unlink_after(self.running)
             raise
         self._unlink_outdated()
-        self._close_account(remember)
+        self.budget.close(whole_run=remember)
         if failures:
             raise failures[0]
         return any(ran)
@@ -193,12 +152,6 @@ class Runner:
         readers = [name for name in later if stage in self._inputs(name) and not STAGES[name].summary]
         return bool(readers) and all(stage in STAGES[name].dispensable for name in readers)
 
-    def _close_account(self, whole_run: bool) -> None:
-        """A run that ended by itself, well or not, is over; one stage of an interrupted run does not end it."""
-        if self.budget and whole_run:
-            self.budget.over = True
-            self.workspace.write_run(self.run_file)
-
     def _unlink_outdated(self) -> None:
         """Take out of ``output/`` what belongs to other settings than the current ones."""
         for name, stage in STAGES.items():
@@ -223,9 +176,9 @@ class Runner:
                 job, manifest, ran = self._found_or_made(stage)
                 self.workspace.link_outputs(self.workspace.folder(stage, job.key), job.stage.published)
                 self.workspace.write_run(self.run_file)
-                self.index.save()
+                self.digests.index.save()
         finally:
-            self._end_work(stage)
+            self.budget.end(stage, time.monotonic() - self.started[stage])
         self.done[stage] = manifest
         self.display.end(stage, manifest.line, time.monotonic() - self.started[stage], cached=not ran)
         return ran
@@ -279,7 +232,7 @@ class Runner:
         needed = {name for one in above for name in needed_for(one, self.options, STAGES)}
         clock = time.monotonic()
         self.done.clear()
-        self.photos = None  # perhaps hours after they were listed
+        self.digests.forget_photos()
         for name in STAGES:
             if name in needed:
                 self._bring_up_to_date(name)
@@ -303,7 +256,7 @@ class Runner:
         else:
             inputs = {name: m.outputs_digest for name, m in upstream.items()}
         config = self._planned(stage, inputs, folders, may_plan)
-        key_config = self._config_for_key(stage, config)
+        key_config = self.digests.config_for_key(stage, config)
         key = stage_key(stage, declared.version, key_config, inputs)
         return Job(declared, config, key_config, inputs, folders, key)
 
@@ -329,9 +282,9 @@ class Runner:
             return declared.config.model_validate(options.model_dump() | {"budget": account.shown(STAGES)})
         if declared.plan is None:
             return options
-        options_for_key = self._config_for_key(stage, options)
-        total = None if self.budget is None else self.budget.total
-        time_given = time_behind_plan(declared, self.options, total)
+        options_for_key = self.digests.config_for_key(stage, options)
+        account = self.budget.account
+        time_given = time_behind_plan(declared, self.options, account and account.total)
         asked = digest({"version": declared.version, "options": options_for_key, "inputs": inputs} | time_given)
         plans = self.run_file.plans.setdefault(stage, {})
         if asked in plans:
@@ -343,7 +296,7 @@ class Runner:
         if not may_plan:
             raise NotReady(stage)
         self._check_inputs(stage, folders)
-        self._begin_work(stage)
+        self.budget.begin(stage, self.times.get(stage))
         clock = time.monotonic()
         with counting(self.workspace.root / RUNNING):
             config = plan_stage(declared, self._with_time(stage, options), folders, self.display)
@@ -352,27 +305,6 @@ class Runner:
         self.workspace.write_run(self.run_file)
         return config
 
-    def _begin_work(self, stage: str) -> None:
-        """From here on ``stage`` costs time of the budget, which nothing does that was found finished."""
-        if self.budget is None or self.works_on == stage or STAGES[stage].is_exempt(self.options[stage]):
-            return
-        if STAGES[stage].summary and self.budget.over:  # it shows that account
-            return
-        self.works_on, self.charged = stage, True
-        self.budget.continue_as(self._options_digest(), self._photos_digest())
-        (self.workspace.root / RUNNING).unlink(missing_ok=True)
-        self.budget.running = stage
-        if (seconds := self.times.get(stage)) is not None:
-            self.budget.allocate(stage, seconds)
-        self.workspace.write_run(self.run_file)
-
-    def _end_work(self, stage: str) -> None:
-        """Note what ``stage`` cost, where it did."""
-        if self.budget and self.works_on == stage:
-            self.budget.end(stage, time.monotonic() - self.started[stage])
-            self.works_on = None
-            self.workspace.write_run(self.run_file)
-
     def _with_time(self, stage: str, options: StageConfig) -> StageConfig:
         """``options`` with the seconds that the run leaves for the stage, where these are open."""
         declared = STAGES[stage]
@@ -380,37 +312,15 @@ class Runner:
             return options
         photos = read_photos(self.workspace.folder(SOURCE, self.done[SOURCE].key))
         reading = reading_seconds(sum(photo.width * photo.height for photo in photos) / 1e6, processors())
-        if self.budget is None:
+        if self.budget.account is None:
             seconds = limited_seconds(declared, self.options, self.times, reading)
-            return options.model_copy(update={"seconds": seconds})
-        # An input that has to be rebuilt is none of the stages that were asked for.
-        order = list(STAGES)
-        after = [name for name in self.stages if order.index(name) > order.index(stage)]
-        to_come = {name: self.times.get(name) for name in after if not STAGES[name].is_exempt(self.options[name])}
-        what_is_left = {stage: None, **to_come}
-        main = (how := declared.flexible) is not None and how.max_share >= 1
-        if main and (why := self.budget.shortage(STAGES, what_is_left, reading)):
-            self.display.note("pipeline.budget-exceeded", f"the budget is too short: {why}")
-        return options.model_copy(update={"seconds": self.budget.give(STAGES, stage, to_come, reading)})
-
-    def _config_for_key(self, stage: str, config: StageConfig) -> dict[str, Any]:
-        replaced = {"photos": self._photos_digest()} if stage == SOURCE else {}
-        return config_for_key(config, self.index, replaced, STAGES[stage].not_hashed)
-
-    def _photos_digest(self) -> str:
-        """Digest of the photos' names and bytes; the last known one where the photos are gone but were ingested."""
-        if self.photos is not None:
-            return self.photos
-        config: Any = self.options[SOURCE]
-        if (known := self.run_file.photos_digest) and is_gone(config.photos):
-            return known
-        source = find_source(config.photos, config.cameras)
-        self.display.update("reading the video" if source.kind == "video" else f"reading {len(source.files)} photos")
-        files = self.index.of_files(source.root, (*source.files, *(mask for _, mask in source.masks)))
-        masks = [(name, os.path.relpath(mask, source.root)) for name, mask in source.masks]
-        self.photos = digest({"kind": source.kind, "frames": source.frames, "masks": masks, "files": files})
-        self.run_file.photos_digest = self.photos
-        return self.photos
+        else:
+            # An input that has to be rebuilt is none of the stages that were asked for.
+            order = list(STAGES)
+            after = [name for name in self.stages if order.index(name) > order.index(stage)]
+            times = {name: self.times.get(name) for name in after}
+            seconds = self.budget.give(stage, times, reading, self.display)
+        return options.model_copy(update={"seconds": seconds})
 
     def find_finished(self, job: Job) -> Manifest | None:
         """The finished result for this job, if there is one; a damaged one is quarantined and said aloud."""
@@ -430,7 +340,7 @@ class Runner:
         partial, folder = self.workspace.partial(name, job.key), self.workspace.folder(name, job.key)
         if name not in self.force and (manifest := self.workspace.complete(partial, folder, job.key)):
             return manifest
-        self._begin_work(name)
+        self.budget.begin(name, self.times.get(name))
         before = elapsed(partial / ATTEMPTS) + self.planning.pop(name, 0.0)
         if partial.exists() and not (stage.resumes and name not in self.force):
             shutil.rmtree(partial)

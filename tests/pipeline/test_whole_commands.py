@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from pipeline.cli.commands import command_demo, run_command
-from pipeline.engine.runner import Runner
+from pipeline.engine.run_digests import RunDigests
 from pipeline.engine.settings import Settings
 from stages.contract import StageError
 
@@ -20,10 +20,10 @@ def test_a_photo_now_unreadable_fails_its_reader(
         Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")
     assert run_command(["run", str(tmp_path / "photos"), "-o", str(tmp_path / "w.nerf"), "--until", "ingest"]) == 0
 
-    def unreadable(_: Runner) -> str:
+    def unreadable(_: RunDigests) -> str:
         raise StageError("ingest.cannot-read", "cannot read 1.png", "Permission denied", "Check its permissions.")
 
-    monkeypatch.setattr(Runner, "_photos_digest", unreadable)
+    monkeypatch.setattr(RunDigests, "of_photos", unreadable)
     assert run_command(["resume", str(tmp_path / "w.nerf")]) == 10
     assert "cannot read 1.png" in capsys.readouterr().err
 

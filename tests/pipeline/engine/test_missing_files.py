@@ -10,6 +10,7 @@ from PIL import Image
 from pipeline.cli.commands import run_command
 from pipeline.engine.display import SilentDisplay
 from pipeline.engine.failures import StageFailed
+from pipeline.engine.run_digests import RunDigests
 from pipeline.engine.runner import Runner
 from pipeline.engine.workspace import Workspace
 from stages.contract import StageError
@@ -38,7 +39,7 @@ def test_no_report_without_photos_and_their_digest(tmp_path: Path, monkeypatch: 
     go = runs_on(tmp_path, monkeypatch)
     go(Machine(), 300.0)
     monkeypatch.setattr(
-        Runner, "_photos_digest", lambda _: (_ for _ in ()).throw(StageError("ingest.cannot-read", "", "", ""))
+        RunDigests, "of_photos", lambda _: (_ for _ in ()).throw(StageError("ingest.cannot-read", "", "", ""))
     )
     with refused("ingest.cannot-read") as caught:
         go(Machine(), 300.0, resume=True, alone=True, stages=("report",))

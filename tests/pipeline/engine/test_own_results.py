@@ -134,7 +134,7 @@ def test_what_the_options_name_inside_goes_with_a_moved_workspace(workspace: Pat
 def test_a_moved_workspace_keeps_its_budget(tmp_path: Path):
     def of_options(root: Path) -> str:
         settings = Settings(sfm=SfmConfig(cameras=root / "sfm" / KEY / "sparse"))
-        return Runner(Workspace(root), settings, SilentDisplay())._options_digest()
+        return Runner(Workspace(root), settings, SilentDisplay()).digests.of_options()
 
     assert of_options(tmp_path / "w.nerf") == of_options(tmp_path / "moved.nerf")
 

@@ -13,6 +13,7 @@ from pipeline.engine import status
 from pipeline.engine.display import SilentDisplay
 from pipeline.engine.failures import StageFailed
 from pipeline.engine.job import NotReady
+from pipeline.engine.run_digests import RunDigests
 from pipeline.engine.runner import Runner
 from pipeline.engine.workspace import Workspace
 from stages.contract import Inputs, StageError, StageResult
@@ -93,7 +94,7 @@ def test_photos_are_listed_once(bring: Bring, tmp_path: Path, known: bool, monke
         Image.new("RGB", (4, 4), (9, 9, 9)).save(tmp_path / "photos/new.png")
     workspace, runner = reader(tmp_path / "w.nerf")
     found, listed = find_source, []
-    monkeypatch.setattr("pipeline.engine.runner.find_source", lambda *given: listed.append(given) or found(*given))
+    monkeypatch.setattr("pipeline.engine.run_digests.find_source", lambda *given: listed.append(given) or found(*given))
     with workspace:
         assert [runner.found(stage) is not None for stage in ALL] == [known] * 3
         runner.run(ALL)
@@ -312,7 +313,7 @@ def test_ctrl_c_reads_no_photos(bring: Bring, tmp_path: Path, monkeypatch: pytes
         raise KeyboardInterrupt
 
     reads: list[str] = []
-    monkeypatch.setattr(Runner, "_photos_digest", interrupted)
+    monkeypatch.setattr(RunDigests, "of_photos", interrupted)
     with pytest.raises(KeyboardInterrupt):
         bring()
     assert reads == ["photos"]

@@ -241,14 +241,14 @@ def runs_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
         with Workspace(machine.root) as workspace:
             runner = Runner(workspace, settings, SilentDisplay())  # type: ignore[arg-type]
             if not resume:
-                runner.set_budget(total, 0.0)
+                runner.budget.set_total(total, 0.0)
             began = machine.now
             try:
                 ran = runner.run(stages, times=times or EXPECTED, replan=replan, remember=not alone)
             except Killed as kill:  # what the runner notes as it is left, no killed program does
                 (machine.root / RUN_FILE).write_bytes(kill.args[0])
                 raise
-        return Outcome(runner.budget, ran, machine.now - began)
+        return Outcome(runner.budget.account, ran, machine.now - began)
 
     return run
 
