@@ -83,6 +83,7 @@ class _Taken:
     clock_s: float | None = None
     time_s: float | None = None
     mask: _TakenMask | None = None
+    white_mask: bool = False
     digest: bytes = b""  # of size and pixels
     thumbnail: np.ndarray | None = None
     opaque: Box | None = None
@@ -133,7 +134,8 @@ def note_findings(photos: Sequence[Photo], converted: Converted, progress: Progr
     messages.note_findings(photos, progress)
     masks = [photo.mask for photo in converted.taken if photo.mask]
     turned, resized = sum(mask.turned for mask in masks), sum(mask.resized for mask in masks)
-    messages.note_masks([mask.ignored for mask in masks], turned, resized, len(photos), progress)
+    ignored = [mask.ignored for mask in masks] + [0.0 for photo in photos if photo.white_mask]
+    messages.note_masks(ignored, turned, resized, len(photos), progress)
 
 
 @contextmanager
@@ -247,6 +249,7 @@ def _take(file: Path, name: str, mask: Path | None, stored: bool, waiting: Path)
         exposure_ev=decoded.exposure_ev,
         clock_s=decoded.clock_s,
         mask=taken_mask,
+        white_mask=mask is not None and taken_mask is None,
         digest=hashlib.blake2b(str(pixels.shape).encode() + pixels.data, digest_size=16).digest(),
         thumbnail=thumbnail(pixels, taken_mask.thumbnail if taken_mask else None),
         opaque=opaque_box(pixels),
@@ -359,6 +362,7 @@ def store(converted: Converted, folder: Path) -> list[Photo]:
                 sharpness=photo.sharpness,
                 relative_sharpness=relative[index],
                 mask=f"masks/{file}.png" if photo.mask else None,
+                white_mask=photo.white_mask,
                 near_duplicate_of=converted.duplicate_of.get(photo.name),
                 time_s=photo.time_s,
                 **photo.gps._asdict(),

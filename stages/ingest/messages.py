@@ -195,7 +195,7 @@ def note_findings(photos: Sequence[Photo], progress: Progress) -> None:
 
 def note_masks(ignored: Sequence[float], turned: int, resized: int, photos: int, progress: Progress) -> None:
     """How many of the photos have masks, how much these ignore, and how many were made to fit."""
-    if not ignored:
+    if not any(ignored):
         return
     turned_words = f", {turned} are turned upright like their photos" if turned else ""
     resized_words = f", {resized} are resized to their photos" if resized else ""

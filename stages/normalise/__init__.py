@@ -49,7 +49,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 STAGE = Stage(
     name="normalise",
     inputs=("ingest", "sfm"),
-    version=18,
+    version=19,
     exit_code=12,
     published=("transforms.json", "scene.json"),
     config=Config,

@@ -65,7 +65,7 @@ def find_alpha(
     masks = _Masks(ingest, photos, model, order)
     if meaning == "cut-out":
         if not masks.photos or any(photo.has_alpha for photo in photos):
-            why = "some photos have alpha" if masks.photos else "no photo has a mask"
+            why = "some photos have alpha" if masks.photos else "no mask ignores anything"
             progress.note("normalise.masks-not-used", f"--normalise.masks cut-out changes nothing: {why}")
             return None
         return masks.as_alpha(forced=True, progress=progress)
@@ -94,7 +94,7 @@ def alpha_or_none(
         return None
     if of_masks:
         others = [photo.name for photo, mask in zip(photos, alpha.masks, strict=True) if photo.mask and not mask]
-        without = [photo.name for photo in photos if photo.mask is None]
+        without = [photo.name for photo in photos if not photo.has_mask]
         but = f"; masks that also hide parts of it only ignore ({listed(others, 3)})" if others else ""
         but += f"; photos without a mask count as opaque ({listed(without, 3)})" if without else ""
         progress.note(
@@ -127,7 +127,7 @@ def _has_alpha(photos: Sequence[Photo], progress: Progress, tracked: bool) -> bo
 
 
 class _Masks:
-    """The masks of those ``photos`` that have one, and whether they follow the outline of what the points show."""
+    """The masks of ``photos`` that ignore something, and whether they follow the outline of what the points show."""
 
     def __init__(self, ingest: Path, photos: Sequence[Photo], model: SparseModel, order: Sequence[int]) -> None:
         self.ingest, self.all, self.model = ingest, photos, model
@@ -143,16 +143,17 @@ class _Masks:
         self.few = [*self.looked_at.values()]
 
     def surround_something(self) -> bool:
-        """Whether most of a few ignore a good part of their photo on two of its opposite sides, and not all the same
-        part, as around a thing."""
-        around = [mask for mask in self.few if _is_around_something(mask)]
-        return 2 * len(around) > len(self.few) and not _are_alike([mask.ignored for mask in self.few])
+        """Whether most masks, as far as a few tell, ignore a good part of their photo on two of its opposite sides, and
+        not all the same part, as around a thing."""
+        around = sum(_is_around_something(mask) for mask in self.few) * len(self.photos)
+        most = 2 * around > sum(photo.has_mask for photo in self.all) * len(self.few)
+        return most and not _are_alike([mask.ignored for mask in self.few])
 
     def why_unknown(self, capture_type: CaptureType) -> str | None:
         """What speaks against masks that surround something cutting out an object, as far as a few tell."""
         if any(photo.has_alpha for photo in self.all):
             return "some photos have alpha"
-        if without := len(self.all) - len(self.photos):
+        if without := sum(not photo.has_mask for photo in self.all):
             return f"{without} of {counted(len(self.all), 'photo')} {'has' if without == 1 else 'have'} no mask"
         if capture_type != "object-centric":
             return "the photos were not taken around an object"

@@ -272,6 +272,7 @@ def test_masks_go_with_their_photos(tmp_path: Path, progress: Any) -> None:
     photos = read_photos(tmp_path / "out")
     assert result.outputs == ("images", "photos.json", "masks")
     assert [photo.mask is not None for photo in photos] == [True, False, False, False, True, True]
+    assert [photo.has_mask for photo in photos] == [True, False, True, False, True, True]
     assert [photo.used_share for photo in photos] == [0.75, 1, 1, 1, 0.5, 0.5]
     for photo, columns in zip([photos[0], photos[4], photos[5]], (8, 16, 16), strict=True):
         file = f"masks/{photo.file.removeprefix('images/')}.png"
@@ -280,7 +281,7 @@ def test_masks_go_with_their_photos(tmp_path: Path, progress: Any) -> None:
         assert np.array_equal(mask, np.broadcast_to(np.where(np.arange(32) < columns, 0, 255), (24, 32)))
     assert progress.codes == ["ingest.stray-masks", "ingest.masks"]
     assert progress.names("ingest.stray-masks", "masks/stranger.png")
-    assert progress.names("ingest.masks", "3 of 6 photos", "42%", "1 are turned", "1 are resized")
+    assert progress.names("ingest.masks", "4 of 6 photos", "31%", "1 are turned", "1 are resized")
 
 
 def test_a_photo_whose_mask_cannot_be_used_is_refused(tmp_path: Path, progress: Any) -> None:

@@ -51,7 +51,10 @@ def outlined(tmp_path: Path, progress: RecordedProgress):
             write_png(tmp_path / file, mask)
             alpha = number < has_alpha
             photo = Photo(f"{number:02d}.jpg", f"images/{number:02d}.jpg", SIDE, SIDE, 0, None, None, alpha, 1.0)
-            photos.append(replace(photo, mask=file if number >= unmasked else None))
+            white = bool(mask.all())  # which ingest does not keep
+            photos.append(
+                photo if number < unmasked else replace(photo, mask=None if white else file, white_mask=white)
+            )
         images = [SimpleNamespace(camera=0, sfm_from_camera=pose) for pose in poses]
         model: Any = SimpleNamespace(
             cameras=[CAMERA], images=images, xyz=scene.points, view=scene.view, point=scene.point
@@ -75,6 +78,23 @@ def test_a_mask_that_hides_part_of_it_stays_one(outlined) -> None:
     found: Alpha = outlined(lambda number, mask: hide_middle(number, mask) if number == 5 else None)
     assert [number for number, mask in enumerate(found.masks) if mask is None] == [5]
     assert found.opaque[5] is None
+
+
+def whiten(number: int, mask: np.ndarray) -> None:
+    mask.fill(255)
+
+
+def test_a_photo_with_a_white_mask_is_opaque(outlined, progress: RecordedProgress) -> None:
+    found: Alpha = outlined(lambda number, mask: whiten(number, mask) if number == 5 else None)
+    assert [number for number, mask in enumerate(found.masks) if mask is None] == [5]
+    assert found.opaque[5] is None
+    assert progress.codes == []
+
+
+def test_among_many_white_masks_few_cut_out_nothing(outlined, progress: RecordedProgress) -> None:
+    assert outlined(lambda number, mask: whiten(number, mask) if number % 2 else None) is not None
+    assert outlined(lambda number, mask: whiten(number, mask) if number % 2 == 0 else None) is None
+    assert progress.codes == []
 
 
 def speck(number: int, mask: np.ndarray) -> None:
