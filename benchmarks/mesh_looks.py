@@ -25,14 +25,13 @@ from stages import mesh
 from stages.contract import Inputs, SilentProgress, plan_stage
 from stages.evaluate.image_metrics import ssim
 from stages.io.files import write_png
-from stages.io.pixels import load_pixels
 from stages.mesh import Config
 from stages.mesh.extraction import Source, extract_mesh, load
 from stages.mesh.files import ColouredMesh
 from stages.mesh.photos.photo import Photo, photo_of, projected, sampled_picture
 from stages.mesh.rasteriser import barycentric, nearest_faces
 from stages.render.renderer import load_renderer
-from stages.train.data import scaled_size, view_mask, view_rays
+from stages.train.data import PhotoReader, view_mask, view_rays
 
 MAX_SHIFT = 8  # image sides, beyond which a vertex lies too far outside to be drawn
 
@@ -106,12 +105,12 @@ def scores(image: np.ndarray, truth: np.ndarray, used: np.ndarray) -> tuple[floa
 
 
 def truth_of(source: Source, photo: Photo) -> tuple[np.ndarray, np.ndarray]:
-    """A photo at the size at which it is scored, (h, w, 3) float32 sRGB in [0, 1], and where no mask excludes it,
-    (h, w) bool."""
-    width, height = scaled_size(photo.camera, None)
-    truth = load_pixels(source.ingest / photo.view.file, width, height)[..., :3] / np.float32(255)
+    """A photo at the size at which it is scored, over the field's background, (h, w, 3) float32 sRGB in [0, 1], and
+    where no mask excludes it, (h, w) bool."""
+    reader = PhotoReader(source.ingest, source.scene, None)
+    truth = reader.pixels(photo.view, source.info["background"]).numpy()
     mask = view_mask(source.ingest, source.scene, photo.view, None)
-    return truth, np.ones((height, width), bool) if mask is None else mask.numpy()
+    return truth, np.ones(truth.shape[:2], bool) if mask is None else mask.numpy()
 
 
 def write_strip(pictures: Path, photo: Photo, images: Iterable[np.ndarray]) -> None:

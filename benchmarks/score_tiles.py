@@ -18,8 +18,8 @@ from benchmarks.record import Record, add_out
 from nerf.training.metrics import psnr
 from stages.evaluate import tiles
 from stages.evaluate.image_metrics import SSIM_WINDOW
-from stages.io.files import read_json
-from stages.io.pixels import load_pixels
+from stages.io.files import read_json, read_scene
+from stages.train.data import PhotoReader
 
 SIZES, FRACTIONS, CHOICES = (16, 24, 32, 64), (0.02, 0.05, 0.1, 0.25), 40
 
@@ -35,12 +35,15 @@ class Maps(NamedTuple):
 def maps(workspace: Path) -> list[Maps]:
     """Of every test photo."""
     output, found = workspace / "output", []
-    files = {photo["name"]: photo["file"] for photo in read_json(output / "photos.json")["photos"]}
-    for image in read_json(output / "metrics.json")["images"]:
+    scene, metrics = read_scene(output), read_json(output / "metrics.json")
+    views = {view.name: view for view in scene.views}
+    for image in metrics["images"]:
         with Image.open(output / image["render"]) as picture:
-            render = np.asarray(picture.convert("RGB"))
-        photo = load_pixels(output / files[image["name"]], render.shape[1], render.shape[0])[..., :3]
-        one, other = (torch.from_numpy(pixels / np.float32(255)).permute(2, 0, 1)[None] for pixels in (render, photo))
+            render = torch.from_numpy(np.asarray(picture.convert("RGB")) / np.float32(255))
+        view = views[image["name"]]
+        downscale = scene.cameras[view.camera].width / render.shape[1]
+        photo = PhotoReader(output, scene, downscale).pixels(view, metrics["background"])
+        one, other = (pixels.permute(2, 0, 1)[None] for pixels in (render, photo))
         similarity = ssim(one, other, SSIM_WINDOW, eps=0.0, padding="valid")[0].mean(0)
         found.append(Maps((one - other)[0].square().mean(0), similarity))
     return found

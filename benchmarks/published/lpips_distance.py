@@ -6,12 +6,14 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
 
 from nerf.geometry.scene import Scene
-from stages.io.pixels import load_pixels
+from stages.io.files import read_json
+from stages.train.data import PhotoReader
 
 VGG = "vgg16-397923af.pth"  # torchvision's file in torch's cache
 Distance = Callable[[Tensor, Tensor], Tensor]
@@ -28,23 +30,17 @@ def load_lpips() -> Distance | None:
 
 
 def mean_lpips(evaluate: Path, ingest: Path, scene: Scene, distance: Distance | None) -> float | None:
-    """Over the test photos at the size of their renders; transparent ones lie over white. None without a network."""
+    """Over the test photos at the size of their renders, over the same background. None without a network."""
     if distance is None:
         return None
-    found = []
+    background, found = read_json(evaluate / "metrics.json")["background"], []
     with torch.no_grad():
         for view in scene.of_split("test"):
-            render = _picture(evaluate / "renders" / Path(view.file.removeprefix("images/")).with_suffix(".png"))
-            photo = _picture(ingest / view.file)
-            if photo.shape != render.shape:
-                photo = torch.nn.functional.interpolate(photo, render.shape[-2:], mode="area")
-            found.append(float(distance(2 * render - 1, 2 * photo - 1)))
+            file = evaluate / "renders" / Path(view.file.removeprefix("images/")).with_suffix(".png")
+            with Image.open(file) as picture:
+                render = torch.from_numpy(np.asarray(picture.convert("RGB")) / np.float32(255))
+            downscale = scene.cameras[view.camera].width / render.shape[1]
+            photo = PhotoReader(ingest, scene, downscale).pixels(view, background)
+            one, other = (2 * pixels.permute(2, 0, 1)[None] - 1 for pixels in (render, photo))
+            found.append(float(distance(one, other)))
     return round(sum(found) / len(found), 3)
-
-
-def _picture(file: Path) -> Tensor:
-    """(1, 3, height, width) in [0, 1]."""
-    with Image.open(file) as opened:
-        width, height = opened.size
-    pixels = torch.from_numpy(load_pixels(file, width, height).copy()).permute(2, 0, 1)[None].float() / 255
-    return pixels[:, :3] if pixels.shape[1] == 3 else torch.lerp(torch.ones(()), pixels[:, :3], pixels[:, 3:])

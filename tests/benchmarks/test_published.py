@@ -1,5 +1,6 @@
 """Published tables: what a folder is, in what it deviates, figures of others, the table, the plot, LPIPS."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from benchmarks.published.protocols import SCENES, Case, deviations, find_case
 from benchmarks.record import Record
 from nerf.geometry.normalisation import Similarity
 from nerf.geometry.scene import Camera, Scene, Split, View
+from stages.io.files import write_json
 
 
 def photo(file: Path, size: tuple[int, int], colour: tuple[int, ...] = (9, 9, 9)) -> None:
@@ -134,14 +136,20 @@ def test_lpips_needs_weights_at_hand(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     assert mean_lpips(tmp_path, tmp_path, scene_of(1, 1), None) is None
 
 
-def test_lpips_compares_renders_with_photos_over_white(tmp_path: Path):
+def test_lpips_compares_renders_with_photos_over_their_background(tmp_path: Path):
     photo(tmp_path / "images" / "1.png", (16, 16), (0, 0, 0, 0))
-    photo(tmp_path / "renders" / "1.png", (8, 8), (255, 255, 255))
     photo(tmp_path / "images" / "2.png", (16, 16), (0, 0, 0, 255))
-    photo(tmp_path / "renders" / "2.png", (8, 8), (255, 255, 255))
+    photo(tmp_path / "images" / "3.png", (16, 16), (0, 0, 0))
+    photo(tmp_path / "images" / "4.png", (16, 16), (0, 0, 0))
+    Image.new("L", (16, 16)).save(tmp_path / "mask.png")
+    for name in "1234":
+        photo(tmp_path / "renders" / f"{name}.png", (8, 8), (255, 255, 255))
+    write_json(tmp_path / "metrics.json", {"background": [1.0, 1.0, 1.0]})
+    scene = scene_of(1, 4, (16, 16))
+    views = (*scene.views[:4], replace(scene.views[4], alpha="mask.png"))
 
     def distance(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
         assert first.shape == second.shape == (1, 3, 8, 8)
         return (first - second).abs().mean() / 2
 
-    assert mean_lpips(tmp_path, tmp_path, scene_of(1, 2), distance) == 0.5
+    assert mean_lpips(tmp_path, tmp_path, replace(scene, views=views, has_alpha=True), distance) == 0.5
