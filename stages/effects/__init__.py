@@ -115,7 +115,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 STAGE = Stage(
     name="effects",
     inputs=("ingest", "sfm", "normalise"),
-    version=19,
+    version=20,
     exit_code=13,
     published=("effects.json",),
     config=Config,

@@ -29,7 +29,6 @@ MIN_MAP_SIDE, MAX_MAP_SIDE = 48, 96
 MAX_MASK_SIDE = 384  # a cell counts as ignored if any pixel in it is, and thin things must not go
 DEPTH_BIAS_VOXELS = 3.0  # the surface lies before the median depth, and the map is coarse
 MIN_COSINE = 0.1  # between viewing ray and normal; below it a vertex is grazed, not visible
-ANGLE_MARGIN = 0.02  # the outermost ray goes through a pixel's centre, the image ends half a cell further
 CHUNK = 1 << 15  # vertices at a time: what fits into a processor's cache
 
 
@@ -52,7 +51,6 @@ class ShadowMap(NamedTuple):
     camera: Camera
     rays: Rays
     depth: np.ndarray  # the largest of a cell and its neighbours, so that silhouettes hide nothing behind them
-    min_cosine: float  # between the optical axis and the outermost ray
     mask: np.ndarray | None  # True where the photo counts, finer than the rays; None: everywhere
 
 
@@ -77,10 +75,9 @@ def shadow_maps(
         mapped = space.map_rays(rays)
         depth = median_depth(grid, mapped.rays, max(grid.values.shape))[..., None]
         depth = torch.where(depth.isinf(), depth, mapped.to_scene(depth)).squeeze(-1).cpu().numpy()
-        min_cosine = float((rays.directions.cpu().double().numpy() @ view.scene_from_camera[:, 2]).min())
         mask = view_mask(ingest, scene, view, max(1.0, longer / MAX_MASK_SIDE))
         depth = maximum_filter(depth, size=3, mode="nearest")
-        return ShadowMap(view, camera, rays, depth, min_cosine, None if mask is None else mask.numpy())
+        return ShadowMap(view, camera, rays, depth, None if mask is None else mask.numpy())
 
     maps = []
     for shadow_map in in_order(map_of, views, grid.low.device):
@@ -133,7 +130,7 @@ def _chunk_visibility(
     for shadow_map in maps:
         offset = vertices - shadow_map.view.scene_from_camera[:, 3]
         distance = np.linalg.norm(offset, axis=1)
-        cell = _cells(offset, distance, shadow_map)
+        cell = _cells(offset, shadow_map)
         inside = np.flatnonzero((cell >= 0) & (distance >= shadow_map.view.near) & (distance <= shadow_map.view.far))
         in_frustum[inside] += 1
         direction = offset[inside] / distance[inside, None]
@@ -147,22 +144,17 @@ def _chunk_visibility(
     return Visibility(in_frustum, visible, direction)
 
 
-def _cells(offset: np.ndarray, distance: np.ndarray, shadow_map: ShadowMap) -> np.ndarray:
-    """The flat index of each point's cell in the shadow map, -1 outside the image and where its mask ignores it.
-
-    Distortion polynomials fold back far outside of the image; points at wider angles than any ray are therefore left
-    out.
-    """
+def _cells(offset: np.ndarray, shadow_map: ShadowMap) -> np.ndarray:
+    """The flat index of each point's cell in the shadow map, -1 outside the image and where its mask ignores it."""
     height, width = shadow_map.depth.shape
     camera = shadow_map.camera
     points = offset @ shadow_map.view.scene_from_camera[:, :3]
     cell = np.full(len(points), -1)
-    ahead = np.flatnonzero(points[:, 2] > max(shadow_map.min_cosine - ANGLE_MARGIN, 1e-6) * distance)
-    position = project(camera, points[ahead]) / [camera.width, camera.height]  # [0, 1) in the image
+    position = project(camera, points) / [camera.width, camera.height]  # [0, 1) in the image
     inside = np.flatnonzero(((position >= 0) & (position < 1)).all(axis=1))
     if shadow_map.mask is not None:
         column, row = (position[inside] * shadow_map.mask.shape[::-1]).astype(np.int64).T
         inside = inside[shadow_map.mask[row, column]]
     column, row = (position[inside] * [width, height]).astype(np.int64).T
-    cell[ahead[inside]] = row * width + column
+    cell[inside] = row * width + column
     return cell

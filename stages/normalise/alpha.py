@@ -22,7 +22,7 @@ from stages.io.amounts import counted
 from stages.io.photos import Box, Photo, ends_within, spread
 from stages.io.pixels import box_of, loaders, pillow
 from stages.io.sparse_model import SparseImage, SparseModel
-from stages.sfm.colmap.cameras import border_rays, project
+from stages.sfm.colmap.cameras import project
 
 MaskMeaning = Literal["cut-out", "ignore"]
 
@@ -136,7 +136,6 @@ class _Masks:
         seen = np.bincount(model.point, minlength=len(model.xyz)) if len(model.point) else np.zeros(len(model.xyz))
         firm = model.xyz[seen >= MIN_PHOTOS]
         self.points = firm[:: -(-len(firm) // MAX_POINTS) or 1]
-        self.narrowest = [float(border_rays(camera)[:, 2].min()) for camera in model.cameras]
         self.looked_at = dict[str, _Mask]()  # by the names of their photos
         few = [self.photos[i] for i in spread(len(self.photos), min(len(self.photos), FEW))]
         self._look_at(few, lambda done: None)
@@ -187,12 +186,10 @@ class _Masks:
 
     def _ignored_points(self, image: SparseImage, ignored: Float[np.ndarray, "rows columns"]) -> float:
         """Of the points that lie in a photo, hidden ones too, the share in cells that its mask ignores whole; 1 where
-        too few lie there. Distortion folds back far outside of a photo: points beyond its corners are left out."""
+        too few lie there."""
         camera, pose = self.model.cameras[image.camera], image.sfm_from_camera
         local = (self.points - pose[:, 3]) @ pose[:, :3]
-        narrowest = max(self.narrowest[image.camera], 0.0)
-        ahead = (local[:, 2] > 0) & (local[:, 2] >= narrowest * np.linalg.norm(local, axis=1))
-        pixels, size = project(camera, local[ahead]), np.array([camera.width, camera.height])
+        pixels, size = project(camera, local), np.array([camera.width, camera.height])
         inside = ((pixels >= 0) & (pixels < size)).all(axis=1)  # NaN is not
         if inside.sum() < MIN_POINTS:
             return 1.0

@@ -20,21 +20,20 @@ from stages.contract import StageError
 from stages.effects.image_effects import new_view_effects, photo_effects
 from stages.io.photos import read_photos
 from stages.io.pixels import OPAQUE_FROM, load_mask, load_pixels, loaders
-from stages.sfm.colmap.cameras import border_rays, mean_focal_and_centre, project
+from stages.sfm.colmap.cameras import mean_focal_and_centre, project
 
 REMAP_SIDE = 1 << 14  # points that OpenCV takes in a row
 
 
 class Photo(NamedTuple):
-    """A training photo: ``focal_px`` its mean focal length, ``min_cosine`` between the optical axis and its outermost
-    ray, ``sharpness`` 1 where it is as sharp as its neighbours, ``effects`` what it does to the scene's colours and
-    ``shown`` what new views do to them. ``has_alpha``: its alpha, if any, says what is background."""
+    """A training photo: ``focal_px`` its mean focal length, ``sharpness`` 1 where it is as sharp as its neighbours,
+    ``effects`` what it does to the scene's colours and ``shown`` what new views do to them. ``has_alpha``: its alpha,
+    if any, says what is background."""
 
     view: View
     camera: Camera
     folder: Path
     focal_px: float
-    min_cosine: float
     sharpness: float
     effects: tuple[ColourEffect, ...]
     shown: tuple[ColourEffect, ...]
@@ -67,15 +66,10 @@ def photos_of(scene: Scene, ingest: Path, field: dict[str, Any]) -> list[Photo]:
 def photo_of(view: View, scene: Scene, ingest: Path, field: dict[str, Any]) -> Photo:
     """One photo; of one that took no part in training, the effects that are expected."""
     camera = scene.cameras[view.camera]
-    focal_px, min_cosine = _optics(camera)
+    focal_px = mean_focal_and_centre(camera)[0]
     effects, shown = photo_effects(field, scene, view), new_view_effects(field)
     sharpness = _sharpness(ingest).get(view.file, 1.0)
-    return Photo(view, camera, ingest, focal_px, min_cosine, sharpness, effects, shown, scene.has_alpha)
-
-
-@lru_cache
-def _optics(camera: Camera) -> tuple[float, float]:
-    return mean_focal_and_centre(camera)[0], float(border_rays(camera)[:, 2].min())
+    return Photo(view, camera, ingest, focal_px, sharpness, effects, shown, scene.has_alpha)
 
 
 @lru_cache(maxsize=1)
@@ -84,14 +78,12 @@ def _sharpness(ingest: Path) -> dict[str, float]:
 
 
 def projected(photo: Photo, points: np.ndarray) -> Projection:
-    """Where a photo shows ``points`` (n, 3) of the scene frame. Distortion polynomials fold back far outside of an
-    image; points at wider angles than the outermost ray are therefore left out."""
+    """Where a photo shows ``points`` (n, 3) of the scene frame."""
     pose = photo.view.scene_from_camera
     local = (points - pose[:, 3]) @ pose[:, :3]
-    distance = np.linalg.norm(local, axis=1)
-    ahead = (local[:, 2] > max(photo.min_cosine - 0.02, 0.02) * distance) & (local[:, 2] > 0)
-    pixels = np.zeros((len(points), 2))
-    pixels[ahead] = project(photo.camera, local[ahead])
+    pixels = project(photo.camera, local)
+    ahead = np.isfinite(pixels).all(axis=1) & (local[:, 2] > 0)
+    pixels[~ahead] = 0
     inside = ahead & ((pixels >= 0) & (pixels < [photo.camera.width, photo.camera.height])).all(axis=1)
     return Projection(pixels, np.where(ahead, local[:, 2], 1.0), ahead, inside)
 

@@ -1,5 +1,7 @@
 """Pixels to rays and back, for every camera model that COLMAP knows."""
 
+from functools import lru_cache
+
 import numpy as np
 import pycolmap
 from jaxtyping import Float
@@ -8,6 +10,7 @@ from nerf.geometry.scene import Camera
 from stages.contract import StageError
 
 ROUND_TRIP_PX = 0.01  # a ray direction that does not project back to its pixel is a false root of the distortion
+ANGLE_MARGIN = 0.02  # of cosines: a surface goes on beside the photos that show it
 CHECKED_PIXELS = (33, 25)  # across and down, the very corners among them: there lenses bend most
 _CLOCKWISE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # of a picture, by a quarter turn
 # Parameters of COLMAP's lenses that are the two parts of a vector in the picture, and turn with it. Tangential terms
@@ -96,8 +99,17 @@ def is_fisheye(model: str) -> bool:
 
 
 def project(camera: Camera, points_camera: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-    """Pixel coordinates of points in the camera's frame; NaN for points behind the camera."""
-    return np.asarray(native(camera).img_from_cam(np.asarray(points_camera, np.float64)))
+    """Pixel coordinates of points in the camera's frame; NaN for points behind the camera and at wider angles to its
+    axis than its corners and ANGLE_MARGIN, where distortions fold back into the image."""
+    points = np.asarray(points_camera, np.float64)
+    within = points[:, 2] >= (_min_cosine(camera) - ANGLE_MARGIN) * np.linalg.norm(points, axis=1)
+    return np.where(within[:, None], np.asarray(native(camera).img_from_cam(points)), np.nan)
+
+
+@lru_cache
+def _min_cosine(camera: Camera) -> float:
+    """Between the optical axis and any pixel's ray, where the camera model has one."""
+    return float(np.fmin.reduce(border_rays(camera)[:, 2], initial=1.0))
 
 
 def rescaled(camera: Camera, width: int, height: int) -> Camera:

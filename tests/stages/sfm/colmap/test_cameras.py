@@ -9,7 +9,7 @@ from nerf.geometry.scene import Camera
 from nerf.synthetic.scenes import ring_of_cameras
 from stages.io.sparse_model import SparseImage, SparseModel
 from stages.sfm.colmap.adjustment.intrinsics import why_degenerate
-from stages.sfm.colmap.cameras import camera_rays, is_valid, native, project, rescaled
+from stages.sfm.colmap.cameras import camera_rays, is_valid, native, project, ray_directions, rescaled
 from stages.sfm.colmap.diagnosis import find_conflict
 from stages.sfm.colmap.models import load_native, read_model, write_model
 from tests.refusals import refused
@@ -77,6 +77,23 @@ def test_points_behind_the_camera_project_nowhere() -> None:
     pixels = project(CAMERAS[4], np.array([[0.0, 0.0, 1.0], [0.1, 0.1, -1.0], [0.0, 0.0, -2.0]]))
     np.testing.assert_allclose(pixels[0], (31, 19), atol=1e-9)
     assert np.isnan(pixels[1:]).all()
+
+
+def test_what_projects_into_the_image_is_seen_there() -> None:
+    """A barrel distortion folds back: far beyond the corners, points have pixels of the image."""
+    camera, points = lens("SIMPLE_RADIAL", 50, 31, 19, -0.2), np.random.default_rng(0).normal(size=(4000, 3))
+    unguarded, pixels = np.asarray(native(camera).img_from_cam(points)), project(camera, points)
+    inside, folded = (((at > 0) & (at < (W, H))).all(axis=1) for at in (pixels, unguarded))
+    assert 100 < inside.sum() < folded.sum()
+    directions = points[inside] / np.linalg.norm(points[inside], axis=1, keepdims=True)
+    np.testing.assert_allclose(ray_directions(camera, pixels[inside]), directions, atol=1e-6)
+
+
+@pytest.mark.parametrize("camera", CAMERAS[:-1], ids=lambda camera: camera.model)
+def test_points_a_little_beside_the_image_have_pixels(camera: Camera) -> None:
+    pixels = project(camera, camera_rays(camera, W, H)[[0, -1], :].reshape(-1, 3) * [1.05, 1.05, 1])
+    assert np.isfinite(pixels).all()
+    assert ((pixels < 0) | (pixels > (W, H))).any()
 
 
 def test_a_camera_with_the_wrong_number_of_parameters_is_refused() -> None:
