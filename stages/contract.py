@@ -161,10 +161,11 @@ def reading_seconds(megapixels: float, cores: int) -> float:
 
 
 class Photos(NamedTuple):
-    """The photos before any is decoded: how many, and how large each is in millions of pixels."""
+    """The photos before any is decoded: how many, how large each is in millions of pixels, and how many have masks."""
 
     number: int
     megapixels: float
+    masked: int = 0
 
     def reading_seconds(self, cores: int) -> float:
         """Seconds that it takes to decode all of them once."""

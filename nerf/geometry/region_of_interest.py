@@ -143,10 +143,13 @@ def _carved(scene: Reconstruction, opaque: Float[np.ndarray, "n 2 2"]) -> Region
     side = np.linspace(-half, half, CARVED)
     points = centre + np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     seen, clear = np.zeros(len(points), int), np.zeros(len(points), int)
-    for view in range(0, len(scene.centres), -(-len(scene.centres) // MAX_CARVING_PHOTOS)):
+    views = range(0, len(scene.centres), -(-len(scene.centres) // MAX_CARVING_PHOTOS))
+    for view in views:
         at, shown = scene.project(view, points)
         seen += shown
         clear += shown & ~within(at, opaque[view])
+        kept = clear <= MISTAKEN * len(views)  # the others are background even if all photos show them
+        points, seen, clear = points[kept], seen[kept], clear[kept]
     left = points[(seen > clear) & (clear <= MISTAKEN * seen)]
     if not len(left):
         return Region(centre, half)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from pipeline.schedule.budget import Stages, Times, max_total, min_total
 from stages.contract import BudgetLeft, Photos, Stage, StageConfig, StageError, Workload
+from stages.ingest.auxiliary_files import pair_masks
 from stages.ingest.sources import find_source
 from stages.io.amounts import duration, least_duration, rough_duration
 
@@ -28,7 +29,8 @@ def photos_of(config: "IngestConfig") -> Photos | None:
     except StageError:  # ingest says what is wrong with them, where it has to run at all
         return None
     pixels = pixel_count(source.files[len(source.files) // 2]) or UNREADABLE_PIXELS
-    return Photos(len(source.files), pixels / 1e6)
+    masks, _ = pair_masks([source.name(file) for file in source.files], source.masks)
+    return Photos(len(source.files), pixels / 1e6, len(masks))
 
 
 def expected_times(stages: Stages, workload: Workload, budgeted: bool) -> dict[str, float | None]:

@@ -58,6 +58,20 @@ def test_photos_are_counted_and_measured_without_decoding(photos: Path) -> None:
     (photos / "2.png").write_bytes(png(20_000, 12_000, b""))  # Pillow's own limit is lower than ours
     assert photos_of(settings(photos)) == Photos(5, 240.0)
     assert photos_of(settings(photos / "gone")) is None
+
+
+def test_masks_are_counted_and_take_normalise_time(photos: Path) -> None:
+    (photos / "masks").mkdir()
+    for name in ("0.png", "3.png.png", "stranger.png"):
+        Image.new("L", (200, 150)).save(photos / "masks" / name)
+    assert photos_of(settings(photos)) == Photos(5, 0.03, masked=2)
+
+    def seconds(masked: int, masks: str | None = None) -> float:
+        found = expected(settings(photos, normalise={"masks": masks}), Photos(145, 12.0, masked))["normalise"]
+        assert found is not None
+        return found
+
+    assert seconds(0) == seconds(145, "ignore") < seconds(24) < 2 < seconds(145) < 8
     (photos / "empty").mkdir()
     assert photos_of(settings(photos / "empty")) is None
 
