@@ -61,7 +61,7 @@ def verdict(metrics: dict[str, Any]) -> str:
     gain = f"{value - nearest:.1f} dB better than the nearest training view"
     if value <= mean:
         what = f"Unusable: {value:.1f} dB is no better than the mean training image ({mean:.1f} dB)"
-        what += "; check the cameras, then train longer"
+        what += "; train longer, or add photos that overlap with these"  # doubtful cameras are the report's to tell
     elif value <= nearest:
         what = f"Worse than the nearest training view ({value:.1f} against {nearest:.1f} dB): train longer"
     elif value < 22 or _below(similarity, 0.7):

@@ -73,7 +73,7 @@ STAGE = Stage(
         "viewer",
         "tradeoff",
     ),
-    version=17,
+    version=18,
     exit_code=18,
     published=("report.html", "summary.json"),
     config=Config,

@@ -41,6 +41,35 @@ if TYPE_CHECKING:
 
 WIDTH_LARGE, WIDTH_SMALL = 900, 420  # pixels of a picture in the page
 THUMBNAIL_PX = 160
+# The facts of stage mesh in words, with their units; the space of its grid is told with the iso-level.
+MESH_FIGURES = {
+    "faces": ("faces", ""),
+    "vertices": ("vertices", ""),
+    "watertight": ("watertight", ""),
+    "boundary": ("boundary", ""),
+    "surface_area": ("surface area", " square units of the files"),
+    "frame": ("frame of the files", ""),
+    "resolution": ("grid points along an edge", ""),
+    "voxel": ("voxel size", " units of the files"),
+    "iso_level": ("iso-level of the density", " per scene unit"),
+    "iso_level_reason": ("why this iso-level", ""),
+    "surface_error_voxels": ("distance from half of the transmittance", " voxels"),
+    "components_kept": ("components kept", ""),
+    "components_dropped": ("components removed", ""),
+    "faces_outside_photos": ("faces removed outside of all photos", ""),
+    "faces_hidden": ("faces removed that no photo sees", ""),
+    "holes_closed": ("holes closed", ""),
+    "holes_left": ("holes left open", ""),
+    "invented_area_share": ("area that closes holes", "%"),
+    "refined_voxels": ("refinement moved vertices by", " voxels (median)"),
+    "photo_agreement_before": ("agreement of photos before refinement", " of 1"),
+    "photo_agreement": ("agreement of photos after refinement", " of 1"),
+    "texture": ("texture", " pixels"),
+    "texels_per_pixel": ("texture pixels per photo pixel", ""),
+    "texture_without_photo": ("texture that no photo shows", "%"),
+    "texture_outliers": ("photo colours left out as outliers", "%"),
+    "appearance": ("colours are shown at", ""),
+}
 MAX_SMALL = 12  # further test photos shown, besides the best, the median and the worst
 
 
@@ -149,6 +178,7 @@ def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
         scored_on=scored_on(results.metrics) if results.metrics and results.metrics["images"] else None,
         compared=(compared := _compared(results)),
         opening=_opening(results, compared),
+        mesh_figures=_mesh_figures(results.manifests.get("mesh", {}).get("facts", {})),
         video=_video(results.inputs, config.video_limit_mb),
         **_mesh_part(results),
         study=_study(results),
@@ -367,6 +397,20 @@ def _opaque(pixels: np.ndarray, background: int) -> np.ndarray:
         return pixels
     alpha = pixels[..., 3:] / 255
     return np.rint(pixels[..., :3] * alpha + background * (1 - alpha)).astype(np.uint8)
+
+
+def _mesh_figures(facts: dict[str, Any]) -> list[tuple[str, Any, str]]:
+    """What stage mesh told, in the order of MESH_FIGURES: words, value, unit."""
+    found = []
+    for name, (words, unit) in MESH_FIGURES.items():
+        fact = facts.get(name)
+        if unit == "%" and fact is not None:
+            fact = 100 * fact
+        if name == "iso_level":
+            unit = " per unit of normalised device coordinates" if facts.get("grid_space") == "ndc" else unit
+        if name in facts:
+            found.append((words, fact, "" if fact is None else unit))
+    return found
 
 
 def _value(value: Any) -> str:

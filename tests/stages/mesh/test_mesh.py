@@ -19,6 +19,7 @@ from stages.io.files import write_json, write_tensors
 from stages.mesh import extraction, preview, resolution, visibility
 from stages.mesh.extraction import vertex_colours
 from stages.mesh.face_count import default_faces
+from stages.report.page import MESH_FIGURES
 from tests.refusals import refused
 from tests.stages.mesh.test_files import colours_of, upright_mesh
 
@@ -192,6 +193,7 @@ def test_the_facts_are_those_of_the_files(run_mesh):
     loaded = trimesh.load_mesh(folder / "mesh.ply", process=False)
     facts = result.facts
     assert json.loads(json.dumps(facts, allow_nan=False)) == facts
+    assert facts.keys() - MESH_FIGURES.keys() == {"grid_space"}, "the report has no words for others"
     assert (facts["vertices"], facts["faces"]) == (len(loaded.vertices), len(loaded.faces))
     assert facts["watertight"] is True and facts["boundary"] == "watertight"
     assert facts["surface_area"] == pytest.approx(loaded.area, rel=1e-5)

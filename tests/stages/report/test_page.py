@@ -59,12 +59,12 @@ def test_files_beside_the_page_are_named(tmp_path: Path, progress: Any):
     inputs = make_workspace(tmp_path)
     manifest = json.loads((inputs["mesh"] / "manifest.json").read_text("utf-8"))
     manifest["outputs"] = {name: {} for name in ("mesh.glb", "mesh.ply", "preview.png", SMALL_COPY)}
-    manifest["facts"] |= {"voxel": 0.25, "surface_area": 3.5, "iso_level": 40.0}
+    manifest["facts"] |= {"voxel": 0.25, "surface_area": 3.5, "iso_level": 40.0, "texture_outliers": 0.0147}
     write_json(inputs["mesh"] / "manifest.json", manifest)
     html, _ = written(inputs, tmp_path / "out", progress, video_limit_mb=0.001)
     assert "In <code>output/</code>: mesh.glb, mesh.ply." in html
     assert '<a href="video.mp4">' in html and "pass on both" in html
-    for fact in ("0.25 units of the files", "3.5 square units of the files", "40 per scene unit"):
+    for fact in ("0.25 units of the files", "3.5 square units of the files", "40 per scene unit", "1.47%"):
         assert f"<td>{fact}</td>" in html
     assert "pass on both" not in written(inputs, tmp_path / "small", progress)[0]
     manifest["facts"]["grid_space"] = "ndc"
@@ -121,6 +121,7 @@ def test_the_page_opens_with_the_way_to_the_viewer(tmp_path: Path, progress: Any
     html, _ = written(inputs, tmp_path / "out", progress)
     link = re.findall(r'<a class="opening" href="viewer.html".*?</a>', html, re.DOTALL)
     assert len(link) == 1 and link[0].count("<img") == 1 and html.index(link[0]) < html.index("<h1>")
+    assert re.search(r"width: calc\(min\(62vh, 520px\) \* 1\.33", link[0]), "its height is bounded"
     del inputs["evaluate"]
     few, _ = written(inputs, tmp_path / "few", progress)
     assert "<img" not in re.findall(r"<a class=.opening.*?</a>", few, re.DOTALL)[0]
