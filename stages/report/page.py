@@ -125,8 +125,8 @@ def summarise(results: Results) -> dict[str, Any]:
     scale = manifests["scale"]["facts"] if "scale" in manifests else {}
     cameras = _camera_report(results)
     return {
-        "photos": len(results.photos["photos"]) if results.photos else None,
-        **{key: registration.get(key) for key in ("registered", "camera_model", "reprojection_px")},
+        "photos": registration.get("photos", len(results.photos["photos"]) if results.photos else None),
+        **{key: registration.get(key) for key in ("registered", "near_duplicates", "camera_model", "reprojection_px")},
         "cameras_verdict": cameras.verdict,
         "cameras_doubtful": cameras.doubt is not None,
         "field": results.field["kind"] if results.field else None,

@@ -180,6 +180,8 @@ def _line(registration: dict[str, Any]) -> str:
     what += " and adjusted" if (registration["check"] or {}).get("adjusted_from_px") is not None else ""
     error, points = registration["reprojection_px"], registration["points"]
     line = f"{registration['registered']}/{registration['photos']} {what}"
+    if same := registration["near_duplicates"]:
+        line += f", {same} near-duplicate{'s' * (same != 1)} left out"
     line += "" if error is None else f", {error:.2f} px"
     line += f" · {registration['camera_model']}"
     return line + (f" · {points:,} points".replace(",", " ") if points else "")
@@ -188,7 +190,7 @@ def _line(registration: dict[str, Any]) -> str:
 STAGE = Stage(
     name="sfm",
     inputs=("ingest",),
-    version=32,
+    version=33,
     exit_code=11,
     resumes=True,
     published=("sparse", "registration.json"),

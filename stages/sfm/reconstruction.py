@@ -23,6 +23,7 @@ from stages.sfm.pairs.quality_level import GivenOptions, check_matcher, chosen
 from stages.sfm.registration import (
     MIN_MODEL_POINTS,
     MIN_REGISTERED,
+    NEAR_DUPLICATE,
     OVERLAP_HINT,
     count_done,
     image_rows,
@@ -80,9 +81,11 @@ def _photos(ingest: Path) -> tuple[list[Photo], list[Photo]]:
 
 
 def _registration(source: str, images: list[dict[str, Any]], **facts: Any) -> dict[str, Any]:
-    """The content of registration.json."""
+    """The content of registration.json. Near-duplicates are no photos that could be registered and are not."""
     registered = sum(image["registered"] for image in images)
-    return {"source": source, "photos": len(images), "registered": registered, **facts, "images": images}
+    same = sum(image["reason_code"] == NEAR_DUPLICATE for image in images)
+    counts = {"photos": len(images) - same, "registered": registered, "near_duplicates": same}
+    return {"source": source, **counts, **facts, "images": images}
 
 
 def _reconstruct(

@@ -27,6 +27,7 @@ MAX_NAMES = 5
 MAX_SAME_VIEW_PX = 1.0
 PLANAR_CONFIGS = (4, 5, 6)  # colmap TwoViewGeometry: PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
 PAIR_BASE = 2**31 - 1  # pair_id = PAIR_BASE * first image id + second image id
+NEAR_DUPLICATE = "sfm.unregistered-near-duplicate"
 OVERLAP_HINT = "Take photos with 60–80 % overlap, so that each point is visible in at least three of them."
 
 
@@ -180,9 +181,7 @@ def with_near_duplicates(entries: Sequence[dict[str, Any]], photos: Sequence[Pho
     known = {entry["file"]: entry for entry in entries}
     rows = []
     for photo in photos:
-        reason = Note(
-            "sfm.unregistered-near-duplicate", f"a near-duplicate of {photo.near_duplicate_of}: it adds no baseline"
-        )
+        reason = Note(NEAR_DUPLICATE, f"a near-duplicate of {photo.near_duplicate_of}: it adds no baseline")
         duplicate = {
             "file": photo.image_name,
             "registered": False,

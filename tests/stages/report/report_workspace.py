@@ -104,6 +104,7 @@ def _write_registration(folder: Path, count: int) -> None:
     reason = "only 12 matches with any other photo"
     images.append({"file": "9999.png", "registered": False, "reason": reason, "uncertainty_px": None})
     content = {"source": "sfm", "photos": count + 1, "registered": count, "reprojection_px": 0.61, "points": 8123}
+    content |= {"near_duplicates": 0}
     lenses = {"camera_model": "OPENCV", "camera_models": CAMERA_MODELS}
     write_json(folder / "registration.json", content | lenses | {"images": images})
 

@@ -48,11 +48,23 @@ def test_training_that_another_one_went_on_from_counts_in_all(tmp_path: Path, pr
     assert "in all 10 min" in html
 
 
+def test_near_duplicates_do_not_count_as_unregistered(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    registration = read_json(inputs["sfm"] / "registration.json")
+    counts = {"photos": 24, "registered": 24, "near_duplicates": 1}
+    write_json(inputs["sfm"] / "registration.json", registration | counts)
+    html, summary = written(inputs, tmp_path / "out", progress)
+    assert {count: summary[count] for count in counts} == counts
+    assert "24 of 24 photos are registered, 1 near-duplicate left out;" in html
+    assert "Photos without a camera: 1, of which 1 near-duplicate<" in html
+
+
 def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     _, summary = written(inputs, tmp_path / "out", progress)
     assert summary == {
         "photos": 25,
         "registered": 24,
+        "near_duplicates": 0,
         "camera_model": "OPENCV",
         "reprojection_px": 0.61,
         "cameras_verdict": None,

@@ -271,8 +271,8 @@ def test_near_duplicates_are_unmatched_and_masks_exclude_features(
     result = run_stage(sfm.STAGE, SMALL, {"ingest": tmp_path / "ingest"}, tmp_path / "sfm", progress)
     account = read_json(tmp_path / "sfm/registration.json")
     model = read_model(tmp_path / "sfm/sparse")
-    assert result.line.startswith("8/9 registered, ")
-    assert (account["photos"], account["registered"]) == (9, 8)
+    assert result.line.startswith("8/8 registered, 1 near-duplicate left out, ")
+    assert [account[count] for count in ("photos", "registered", "near_duplicates")] == [8, 8, 1]
     assert [image["file"] for image in account["images"]] == list(images)
     assert photos[0].name in account["images"][1].pop("reason")
     assert account["images"][1].pop("reason_code") == "sfm.unregistered-near-duplicate"
