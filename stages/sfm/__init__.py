@@ -84,8 +84,8 @@ class Config(StageConfig):
     camera_params: Auto[tuple[float, ...]] = Field(
         default=None,
         description=(
-            "Known parameters of --sfm.camera-model in COLMAP's order, for photos of this size; they are not "
-            "refined (default: estimated)."
+            "Known parameters of --sfm.camera-model in COLMAP's order, for photos of one size; they turn and scale "
+            "with the others and are not refined (default: estimated)."
         ),
     )
     matcher: Auto[Matcher] = Field(

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nerf.geometry.georeference import georeference
-from nerf.geometry.scene import Camera
 from stages.contract import Note, Progress, StageError, listed
 from stages.hardware.memory import check_memory
 from stages.io.photos import Photo, read_photos
 from stages.sfm.colmap.cameras import is_valid
 from stages.sfm.colmap.database.extraction import ExtractionOptions, feature_bytes
+from stages.sfm.colmap.known_cameras import known_cameras
 from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.conventions import PoseConvention
 from stages.sfm.imported.import_poses import import_poses
@@ -92,7 +92,7 @@ def _reconstruct(
     config: "Config", everything: list[Photo], photos: list[Photo], ingest: Path, folder: Path, progress: Progress
 ) -> tuple[dict[str, Any], str]:
     _check_count(photos, len(everything))
-    _check_camera(config, photos)
+    _check_camera(config, photos, progress)
     check_matcher(config.matcher, capture_priors(photos))
     _check_memory(config, photos)
     names = [photo.image_name for photo in photos]
@@ -149,29 +149,34 @@ def _check_memory(config: "Config", photos: Sequence[Photo]) -> None:
     check_memory(needed, "features of the photos", why, f"Try --sfm.max-image-size {config.max_image_size // 2}.")
 
 
-def _check_camera(config: "Config", photos: Sequence[Photo]) -> None:
-    """Raises StageError where the given intrinsics cannot be those of the photos."""
+def _check_camera(config: "Config", photos: Sequence[Photo], progress: Progress) -> None:
+    """Raises StageError where the given intrinsics cannot be those of the photos, and notes for how many sizes they are
+    adapted."""
     if config.camera_params is None:
         return
     what = "cannot use --sfm.camera-params"
     hint = "Give COLMAP's numbers for these photos: --sfm.camera-model SIMPLE_RADIAL --sfm.camera-params F CX CY K."
     if config.camera_model is None:
         raise StageError("sfm.parameters-without-model", what, "--sfm.camera-model is missing", hint)
-    sizes = sorted({(photo.width, photo.height) for photo in photos})
-    if len(sizes) > 1:
-        listed = ", ".join(f"{width}×{height}" for width, height in sizes[:3])
-        raise StageError(
-            "sfm.parameters-of-several-cameras",
-            what,
-            f"the photos have {len(sizes)} sizes ({listed}), and the parameters are for one",
-            hint,
-        )
     try:
-        valid = is_valid(Camera(config.camera_model, *sizes[0], config.camera_params))
+        cameras = known_cameras(photos, config.camera_model, config.camera_params)
     except ValueError as error:
         raise StageError("sfm.parameter-count", what, str(error), hint) from error
-    if not valid:
+    if others := [f"{p.name} ({p.width}×{p.height})" for p, one in zip(photos, cameras, strict=True) if one is None]:
+        raise StageError(
+            "sfm.parameters-of-other-photos",
+            what,
+            f"{len(others)} of {len(photos)} photos do not have the shape of the photos that the parameters are for: "
+            f"{listed(others, MAX_NAMES)}",
+            "Give the parameters of one of the photos' sizes, and leave out photos of another shape.",
+        )
+    if not all(is_valid(camera) for camera in cameras if camera):
         raise StageError("sfm.focal-not-positive", what, "a focal length is not positive", hint)
+    if adapted := sum(camera.params != config.camera_params for camera in cameras if camera):
+        progress.note(
+            "sfm.parameters-adapted",
+            f"--sfm.camera-params are turned or rescaled with {adapted} of {len(photos)} photos",
+        )
 
 
 # --- what an interrupted run left

@@ -81,9 +81,15 @@ def test_too_few_photos_are_refused_at_once(count: int, tmp_path: Path, progress
         ),
         (
             {"camera_model": "SIMPLE_PINHOLE", "camera_params": (250.0, 120.0, 90.0)},
+            [(240, 180), (180, 240), (240, 136)],
+            "parameters-of-other-photos",
+            "1 of 3 photos do not have the shape of the photos that the parameters are for: 2.png (240×136)",
+        ),
+        (
+            {"camera_model": "SIMPLE_PINHOLE", "camera_params": (250.0, 80.0, 60.0)},
             [(240, 180), (180, 240)],
-            "parameters-of-several-cameras",
-            "2 sizes (180×240, 240×180)",
+            "parameters-of-other-photos",
+            "3 of 3 photos",
         ),
     ],
 )

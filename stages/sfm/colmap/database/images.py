@@ -8,8 +8,11 @@ from types import MappingProxyType
 
 import pycolmap
 
+from nerf.geometry.scene import Camera
 from stages.ingest.orientation import QUARTER_TURNS
 from stages.io.photos import Photo
+from stages.sfm.colmap.cameras import native
+from stages.sfm.colmap.known_cameras import known_cameras
 
 FOCAL_GUESS = 1.2  # focal length over the longer side where EXIF is silent: 45 degrees, a phone's main camera
 MAPPING_MODEL = "SIMPLE_RADIAL"  # one focal length and one distortion term hold with few matches
@@ -37,21 +40,22 @@ def fill_database(
     turns: Turns = NO_TURNS,
 ) -> None:
     """Enter photos (in order of ``file``) and their cameras, all or nothing: one for each camera group with ``turns``,
-    and one for each way in which it was held without.
-
-    Known ``camera_params`` are those of one camera for all photos.
-    """
+    and one for each way in which it was held without. Of known ``camera_params`` all photos have their camera
+    (known_cameras.py)."""
     with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
         if db.num_images():
             return
-        camera_ids: dict[tuple[int, int | None], int] = {}
-        for image_id, photo in enumerate(photos, start=1):
-            held = None if camera_params or turns else photo.orientation
-            group = (0 if camera_params else photo.camera_group, held)
+        camera_ids: dict[tuple[int, int | None] | Camera, int] = {}
+        known = known_cameras(photos, camera_model, camera_params) if camera_params else [None] * len(photos)
+        for image_id, (photo, given) in enumerate(zip(photos, known, strict=True), start=1):
+            group = given or (photo.camera_group, None if turns else photo.orientation)
             if group not in camera_ids:
-                camera_ids[group] = len(camera_ids) + 1
+                camera_ids[group] = camera_id = len(camera_ids) + 1
                 size = size_on_sensor(photo, turns.get(photo.image_name, 0))
-                camera = _first_guess(size, photo.focal_px, camera_model, camera_params, camera_ids[group])
+                camera = (
+                    native(given, camera_id) if given else _first_guess(size, photo.focal_px, camera_model, camera_id)
+                )
+                camera.has_prior_focal_length |= given is not None
                 enter_camera(db, camera)
             enter_image(db, photo.image_name, camera_ids[group], image_id)
 
@@ -75,14 +79,8 @@ def enter_image(db: pycolmap.Database, name: str, camera_id: int, image_id: int)
     db.write_frame(frame, use_frame_id=True)
 
 
-def _first_guess(
-    size: tuple[int, int], focal_px: float | None, model: str, params: Sequence[float] | None, camera_id: int
-) -> pycolmap.Camera:
-    """The camera of photos of this width and height: as it is known, by EXIF's focal length, or by a guess."""
-    if params is not None:
-        camera = pycolmap.Camera(camera_id=camera_id, model=model, width=size[0], height=size[1], params=list(params))
-        camera.has_prior_focal_length = True
-        return camera
+def _first_guess(size: tuple[int, int], focal_px: float | None, model: str, camera_id: int) -> pycolmap.Camera:
+    """The camera of photos of this width and height: by EXIF's focal length, or by a guess."""
     fisheye = model.endswith("FISHEYE")
     guess = fisheye_focal_px(*size) if fisheye else FOCAL_GUESS * max(size)
     camera = pycolmap.Camera.create_from_model_name(camera_id, model, focal_px or guess, *size)
