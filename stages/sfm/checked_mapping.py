@@ -1,6 +1,7 @@
 """From matches to a model whose poses pass the check, compared with global mapping. Runs in the worker process."""
 
 import shutil
+import time
 from collections.abc import Collection, Sequence
 from itertools import count
 from pathlib import Path
@@ -30,7 +31,13 @@ from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import copy_consistent_matches, deregister, drop_outside_main_segment, register_again
 from stages.sfm.job import JobState
 from stages.sfm.matching import capture_sequence, consecutive_pairs
-from stages.sfm.retry_strategies import MIN_MISSING_TO_START_OVER, STRATEGIES, MappingOptions, Strategy
+from stages.sfm.retry_strategies import (
+    FINAL_ADJUSTMENT_FACTOR,
+    MIN_MISSING_TO_START_OVER,
+    STRATEGIES,
+    MappingOptions,
+    Strategy,
+)
 
 CALIBRATING_PHOTOS = 40
 MAX_STRAY_FRACTION = 0.05  # of all photos: so few outside the sequence do not say that the scene repeats itself
@@ -103,7 +110,7 @@ def run_mapping(strategy: Strategy, database: Path, state: JobState) -> Mapped |
             release_focal_lengths(found[0])
         if found and trusted:
             found = _most_steps(found, matches, mapping, hold_focal, state, trusted)
-    failure = global_mapping.failure(global_run) if global_run else None
+    failure = _global_failure(global_run, state) if global_run else None
     mapped = None
     if found:
         if trusted:
@@ -242,6 +249,16 @@ def _start_global_mapping(
         return None
     thinned, folder = state.sibling("global"), state.log.folder / "global"
     return global_mapping.start(matches, thinned, state.images, folder, state.job.seed, cameras_are_known)
+
+
+def _global_failure(started: "global_mapping.Started", state: JobState) -> str | None:
+    """Why there is no model of global mapping to compare with, which is said; None if there is one. It may not take the
+    time in which the model that there is has to be adjusted."""
+    for_adjustment = FINAL_ADJUSTMENT_FACTOR * (time.monotonic() - started.began)
+    seconds = min(global_mapping.patience(started), state.left_at_most() - for_adjustment)
+    if failure := global_mapping.failure(started, seconds):
+        state.send(note=Note("sfm.not-compared", f"global mapping gave no model to compare with: {failure}"))
+    return failure
 
 
 def _checked(model: Any, other: Any, given: MappingInput, state: JobState) -> CheckedModel:

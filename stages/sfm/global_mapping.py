@@ -10,9 +10,11 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import NamedTuple
 
+from stages.io.amounts import rough_duration
 from stages.io.files import make_durable
 from stages.sfm.colmap.database.thinning import thin_matches
 from stages.sfm.colmap.mappers import map_globally
@@ -21,6 +23,9 @@ from stages.sfm.job import end_with_parent
 from stages.sfm.worker_process import environment
 
 TRACKS_PER_PHOTO = 200  # of the best: enough for poses that are compared, not kept
+# It works on fewer tracks than incremental mapping, on a core of its own, and has no limit itself: where it takes so
+# many times as long, it will not end either.
+MAX_TIMES, MIN_SECONDS = 4.0, 60.0
 MIN_PHOTOS = 10  # of fewer there is no telling which of two models is right
 COMMAND = ["-P", "-m", "stages.sfm.global_mapping"]
 
@@ -30,6 +35,7 @@ class Started(NamedTuple):
 
     process: "subprocess.Popen[bytes]"
     folder: Path
+    began: float  # time.monotonic()
 
 
 def start(database: Path, thinned: Path, images: Path, folder: Path, seed: int, camera_is_known: bool) -> Started:
@@ -44,15 +50,26 @@ def start(database: Path, thinned: Path, images: Path, folder: Path, seed: int, 
     assert process.stdin
     process.stdin.write(json.dumps(job | {"camera_is_known": camera_is_known}).encode() + b"\n")
     process.stdin.flush()  # and left open: its end tells the process that this one is gone
-    return Started(process, folder)
+    return Started(process, folder, time.monotonic())
 
 
-def failure(started: Started) -> str | None:
-    """Wait until it is done: why there is no model, None if there is one."""
-    code = started.process.wait()
+def failure(started: Started, seconds: float) -> str | None:
+    """Wait until it is done, or so many ``seconds`` at most: why there is no model, None if there is one."""
+    try:
+        code = started.process.wait(max(0.0, seconds))
+    except subprocess.TimeoutExpired:
+        started.process.kill()
+        started.process.wait()
+        return f"it was given up after {rough_duration(time.monotonic() - started.began)}"
     if code == 0 and started.folder.exists():
         return None
-    return f"global mapping ended with code {code}" if code else "global mapping found no model"
+    return f"it ended with code {code}" if code else "it found no model"
+
+
+def patience(started: Started) -> float:
+    """For how many seconds to wait for it, once incremental mapping is done, which began at the same time."""
+    taken = time.monotonic() - started.began
+    return max(MIN_SECONDS, MAX_TIMES * taken) - taken
 
 
 def main() -> None:

@@ -1,5 +1,7 @@
 """Intrinsics of a few photos, with which mapping of many begins; joined pieces; global mapping beside."""
 
+import subprocess
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -11,7 +13,7 @@ import pytest
 
 from stages.io.photos import Photo
 from stages.sfm import global_mapping
-from stages.sfm.checked_mapping import Runs, _most_steps, _with_pieces_joined, calibrate_by_few
+from stages.sfm.checked_mapping import Runs, _global_failure, _most_steps, _with_pieces_joined, calibrate_by_few
 from stages.sfm.colmap.database.calibration import set_focal_length
 from stages.sfm.colmap.database.copies import copy_without_pairs
 from stages.sfm.colmap.database.images import fill_database
@@ -147,7 +149,7 @@ def test_global_mapping_runs_beside_and_agrees(made: Made, tmp_path: Path) -> No
     started = global_mapping.start(
         made.database, tmp_path / "thinned.db", tmp_path, tmp_path / "global", 0, camera_is_known=False
     )
-    assert global_mapping.failure(started) is None
+    assert global_mapping.failure(started, 600.0) is None
     compared = compare_models(made.model, pycolmap.Reconstruction(tmp_path / "global"))
     assert compared["agree"] == PHOTOS and compared["centre"] < 0.02 and compared["different"] == []
 
@@ -158,4 +160,27 @@ def test_what_global_mapping_dies_of_is_told(tmp_path: Path) -> None:
     started = global_mapping.start(
         damaged, tmp_path / "thinned.db", tmp_path, tmp_path / "global", 0, camera_is_known=False
     )
-    assert "code" in (global_mapping.failure(started) or "")
+    assert "code" in (global_mapping.failure(started, 600.0) or "")
+
+
+@pytest.mark.parametrize(
+    ("mapped_for", "left", "seconds"),
+    [(5.0, 1000.0, 55.0), (100.0, 1000.0, 300.0), (100.0, 210.0, 10.0), (100.0, 50.0, 0.0)],
+    ids=["a minute", "as mapping took", "the adjustment comes first", "none is left"],
+)
+def test_global_mapping_that_does_not_end_is_given_up(
+    mapped_for: float, left: float, seconds: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited, notes = [], []
+    process: Any = SimpleNamespace(wait=lambda timeout=None: waited.append(timeout), kill=lambda: waited.append("kill"))
+    started = global_mapping.Started(process, Path("absent"), time.monotonic() - mapped_for)
+    state: Any = SimpleNamespace(left_at_most=lambda: left, send=lambda note: notes.append(note))
+    _global_failure(started, state)
+    assert waited == [pytest.approx(seconds, abs=1.0)]
+    monkeypatch.setattr(process, "wait", lambda timeout=None: waited.append(timeout) if timeout is None else late())
+    assert "given up" in (_global_failure(started, state) or "")
+    assert waited[1:] == ["kill", None] and [note.code for note in notes] == ["sfm.not-compared"] * 2
+
+
+def late() -> None:
+    raise subprocess.TimeoutExpired("global mapping", 1.0)
