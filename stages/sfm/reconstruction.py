@@ -69,7 +69,8 @@ def find_cameras(config: "Config", ingest: Path, folder: Path, progress: Progres
     photos, matched = _photos(ingest)
     if config.cameras is not None:
         convention = PoseConvention(config.pose_direction, config.camera_axes)
-        imported = import_poses(config.cameras, convention, photos, ingest, folder, config.adjust_poses, progress)
+        limits = config.adjust_poses, config.max_seconds
+        imported = import_poses(config.cameras, convention, photos, ingest, folder, *limits, progress)
         return _registration("import", **imported), ""
     return _reconstruct(config, photos, matched, ingest, folder, progress)
 

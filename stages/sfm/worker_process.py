@@ -9,10 +9,10 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 from stages.contract import Progress, StageError
 from stages.hardware import cluster
@@ -49,27 +49,17 @@ def run_worker(
     latest: dict[str, Any] = {"phase": "features", "database": job["database"], "done": 0, "pairs": 0}
     latest["strategy"] = STRATEGIES[0].name
     log = folder / "sfm.log"
-    with log.open("ab") as stderr:
-        child = _start(stderr)
-        overtime = threading.Timer(config.max_seconds, child.kill)
-        overtime.start()
-        assert child.stdin and child.stdout
-        try:
-            with live_line(progress, lambda: _describe(latest, len(photos))):
-                _hand_over(child.stdin, job)
-                for message in map(json.loads, child.stdout):
-                    if note := message.pop("note", None):
-                        progress.note(*note)
-                    begins = message.get("phase", latest["phase"]) != latest["phase"]
-                    latest.update(message)
-                    if begins:  # a phase may take less than the live line waits
-                        progress.update(*_describe(latest, len(photos)))
-            status = child.wait()
-        finally:
-            late = not overtime.is_alive()
-            overtime.cancel()
-            child.kill()
-            child.wait()
+
+    def hear(message: dict[str, Any]) -> None:
+        if note := message.pop("note", None):
+            progress.note(*note)
+        begins = message.get("phase", latest["phase"]) != latest["phase"]
+        latest.update(message)
+        if begins:  # a phase may take less than the live line waits
+            progress.update(*_describe(latest, len(photos)))
+
+    with live_line(progress, lambda: _describe(latest, len(photos))):
+        status, late = run_child(COMMAND, log, job, config.max_seconds, hear)
     if error := latest.get("error"):
         raise StageError(*error)
     if "result" not in latest:
@@ -77,6 +67,38 @@ def run_worker(
         last = latest.get("fault") or _last_line(log)
         raise _worker_failed(status, limit, latest["phase"], last, _without(latest["strategy"], status, late, log), log)
     return latest["result"]
+
+
+class Ending(NamedTuple):
+    """How a child process ended: its exit status, and whether it was killed because its time was over."""
+
+    status: int
+    late: bool
+
+
+def run_child(
+    command: Sequence[str], log: Path, job: dict[str, Any], max_seconds: float, hear: Callable[[dict[str, Any]], None]
+) -> Ending:
+    """Run Python with this command line, in which COLMAP works. It gets the job on stdin as a line of JSON; ``hear``
+    gets each of its messages, which are such lines, too; what else it prints goes to the log. It is killed after
+    ``max_seconds``."""
+    with log.open("ab") as stderr:
+        child = _start(command, stderr)
+        overtime = threading.Timer(max_seconds, child.kill)
+        overtime.start()
+        assert child.stdin and child.stdout
+        try:
+            _hand_over(child.stdin, job)
+            for line in child.stdout:
+                if line.endswith(b"\n"):  # else it was killed as it wrote
+                    hear(json.loads(line))
+            status = child.wait()
+        finally:
+            late = not overtime.is_alive()
+            overtime.cancel()
+            child.kill()
+            child.wait()
+    return Ending(status, late)
 
 
 def _without(strategy: str, status: int, late: bool, log: Path) -> str | None:
@@ -91,9 +113,9 @@ def _without(strategy: str, status: int, late: bool, log: Path) -> str | None:
     return f"Run again: the strategy {strategy!r} is then skipped. Log: {log}"
 
 
-def _start(stderr: IO[bytes]) -> subprocess.Popen[bytes]:
+def _start(command: Sequence[str], stderr: IO[bytes]) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        [sys.executable, *COMMAND],
+        [sys.executable, *command],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=stderr,

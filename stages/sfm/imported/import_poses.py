@@ -39,6 +39,7 @@ def import_poses(
     ingest: Path,
     folder: Path,
     adjust: bool,
+    max_seconds: float,
     progress: Progress,
 ) -> dict[str, Any]:
     """Write ``sparse/`` from imported poses, and check them against the photos, which may ``adjust`` them where they
@@ -47,7 +48,7 @@ def import_poses(
     Raises StageError where they cannot be used, and where their photos show that they are of another convention.
     """
     known, errors = write_imported_model(cameras, convention, photos, ingest, folder, progress)
-    check = _check(known, photos, ingest, folder, (cameras / "images.txt").is_file(), adjust, progress)
+    check = _check(known, photos, ingest, folder, (cameras / "images.txt").is_file(), adjust, max_seconds, progress)
     if check and (fit := check.pop("fit")):
         read_as = convention.with_defaults(convention_of_format(cameras))
         names = _names(known.model, photos)
@@ -151,14 +152,15 @@ def _check(
     folder: Path,
     of_quaternions: bool,
     adjust: bool,
+    max_seconds: float,
     progress: Progress,
 ) -> dict[str, Any] | None:
     """What verified matches of neighbouring photos say of imported poses; None, with a note, where they say nothing."""
-    progress.update("comparing the imported poses with matches of neighbouring photos")
     posed = {image.file for image in known.model.images}
     posed_photos = [photo for photo in photos if photo.image_name in posed]
+    tests = known.test_files or ()
     check = check_imported_poses(
-        posed_photos, ingest / "images", folder, known.test_files or (), of_quaternions, adjust
+        posed_photos, ingest / "images", folder, tests, of_quaternions, adjust, max_seconds, progress
     )
     if why := check.get("failed"):
         progress.note("sfm.poses-unchecked", f"the imported poses were not checked: {why}")
@@ -192,7 +194,7 @@ def _improved(
         model, errors = replace(model, view=view, **points), found.error_px
     if model is not known.model:
         write_model(folder / "sparse", model)
-    for scratch in ("check", ADJUSTED, POINTS):
+    for scratch in (ADJUSTED, POINTS):
         shutil.rmtree(folder / scratch, ignore_errors=True)
     return replace(known, model=model), errors
 
