@@ -46,7 +46,7 @@ def main() -> None:
             if distortion:
                 database = Path(scratch, "distorted.db")
                 distort(asked.database, database, distortion)
-            told = thin_matches(database, thinned)
+            told = thin_matches(database, thinned).all
             calibrated = focal_length(thinned)
             for factor in asked.focal:
                 begin_with(thinned, factor * calibrated)

@@ -2,6 +2,7 @@
 
 import shutil
 import time
+from collections import Counter
 from collections.abc import Collection, Sequence
 from itertools import count
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any, NamedTuple
 from stages.contract import Note
 from stages.sfm import global_mapping
 from stages.sfm.colmap.adjustment.bundle_adjustment import release_focal_lengths
-from stages.sfm.colmap.database.calibration import MAX_EXIF_RATIO, far_apart
+from stages.sfm.colmap.database.calibration import MAX_EXIF_RATIO, Told, far_apart
 from stages.sfm.colmap.database.images import adopt_cameras
 from stages.sfm.colmap.database.matching import best_linked
 from stages.sfm.colmap.database.thinning import thin_matches
@@ -93,20 +94,25 @@ def run_mapping(strategy: Strategy, database: Path, state: JobState) -> Mapped |
     state.begin("mapping", done=0)
     seed, camera_is_known = state.job.seed, state.job.camera_params is not None
     models, matches = Path(state.job.folder, "models"), database
-    mapping, hold_focal, calibrated = strategy.mapping or MappingOptions(), False, False
+    mapping, hold_focal, held = strategy.mapping or MappingOptions(), False, set[int]()
     if state.thinned:
         matches = state.sibling("thinned")
-        hold_focal = thin_matches(database, matches, camera_is_known=camera_is_known) and mapping.hold_focal
-        calibrated = hold_focal and strategy.mapping is not None and calibrate_by_few(matches, mapping, state)
+        told = thin_matches(database, matches, camera_is_known=camera_is_known)
+        hold_focal = told.all and mapping.hold_focal
+        if told.cameras and mapping.hold_focal and strategy.mapping is not None:
+            held = calibrate_by_few(matches, mapping, told, state)
+    calibrated = len(held) == len({photo.camera_group for photo in state.photos})
     global_run = _start_global_mapping(strategy, matches, camera_is_known or calibrated, state)
-    options = incremental_options(seed, mapping, camera_is_known, state.thinned, hold_focal)
+    # Where some cameras are not told, what COLMAP holds of the others is all of them.
+    held = set() if hold_focal else held
+    options = incremental_options(seed, mapping, camera_is_known, state.thinned, hold_focal, held)
     trusted = consecutive_pairs(state) if strategy.matches == "consecutive" else set[tuple[int, int]]()
     if strategy.mapping is None:
         found = map_globally(matches, state.images, models, seed, camera_is_known)
         shutil.rmtree(models)
     else:
         found = _map_incrementally(matches, options, state)
-        if found and hold_focal:
+        if found and (hold_focal or held):
             release_focal_lengths(found[0])
         if found and trusted:
             found = _most_steps(found, matches, mapping, hold_focal, state, trusted)
@@ -135,7 +141,7 @@ def register_missing(strategy: Strategy, database: Path, state: JobState) -> Map
     model, matches, hold_focal = load_native(state.log.model(best.name)), database, False
     if state.thinned:
         matches = state.sibling("missing-thinned")
-        hold_focal = thin_matches(database, matches, camera_is_known=known) and strategy.mapping.hold_focal
+        hold_focal = thin_matches(database, matches, camera_is_known=known).all and strategy.mapping.hold_focal
     options = incremental_options(seed, strategy.mapping, known, state.thinned, hold_focal)
     scratch = Path(state.job.folder, "again")
     model = register_again(model, check_model(model, database, seed), matches, state.images, scratch, options)
@@ -144,33 +150,31 @@ def register_missing(strategy: Strategy, database: Path, state: JobState) -> Map
     return Mapped([checked.model], checked, best.global_mapping)
 
 
-def calibrate_by_few(matches: Path, mapping: MappingOptions, state: JobState) -> bool:
-    """Give the cameras that the best linked photos share the intrinsics of a model of these alone. Returns whether
-    these are the cameras of all photos.
+def calibrate_by_few(matches: Path, mapping: MappingOptions, told: Told, state: JobState) -> set[int]:
+    """Give the cameras that the best linked photos share, of those whose focal lengths are ``told``, the intrinsics of
+    a model of these photos alone. Returns these cameras (ids); where some are not told only those of several photos.
 
     All pairs together know nothing of distortion. Where the camera looks across its path, photo by photo, mapping with
     a focal length that is a little off bends a straight path, in the end to a circle, and no adjustment of hundreds of
     photos straightens it. A few photos hardly bend. Focal lengths far from what all pairs tell are not believed.
     """
-    few = best_linked(matches, CALIBRATING_PHOTOS)
+    few = best_linked(matches, CALIBRATING_PHOTOS, told.cameras)
     options = incremental_options(state.job.seed, mapping, False, state.thinned, True)
     options.image_names = few
     found = _map_incrementally(matches, options, state)
     if not found or 2 * found[0].num_reg_images() < len(few):
-        return False
-    told = {camera.camera_id: camera.mean_focal_length() for camera in found[0].cameras.values()}
+        return set()
+    before = {camera.camera_id: camera.mean_focal_length() for camera in found[0].cameras.values()}
     release_focal_lengths(found[0])
-    known = [
-        image_id
-        for image_id in sorted(found[0].reg_image_ids())
-        if not far_apart(
-            told[camera := found[0].image(image_id).camera_id],
-            found[0].camera(camera).mean_focal_length(),
-            MAX_EXIF_RATIO,
-        )
-    ]
-    adopted = adopt_cameras(matches, found[0], known)
-    return len(adopted) == len({photo.camera_group for photo in state.photos})
+    photos = Counter(found[0].image(image_id).camera_id for image_id in found[0].reg_image_ids())
+    known = {
+        camera
+        for camera, count in photos.items()
+        if (told.all or count >= MIN_PHOTOS_OF_CAMERA)
+        and not far_apart(before[camera], found[0].camera(camera).mean_focal_length(), MAX_EXIF_RATIO)
+    }
+    adopt_cameras(matches, found[0], known)
+    return known
 
 
 def _map_incrementally(matches: Path, options: Any, state: JobState) -> list[Any]:
@@ -205,7 +209,8 @@ def _most_steps(
     ranked = by_length(found)
     model, (longest, *_) = ranked[0]
     if not known and len(longest) >= MIN_PHOTOS_OF_CAMERA:
-        held = adopt_cameras(matches, model, longest)
+        held = {model.image(image_id).camera_id for image_id in longest}
+        adopt_cameras(matches, model, held)
         options = incremental_options(state.job.seed, mapping, known, state.thinned, hold_focal, held)
         again = by_length(_map_incrementally(matches, options, state))
         ranked = max(ranked, again, key=lambda models: models[0].length if models else 0)

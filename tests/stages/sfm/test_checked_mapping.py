@@ -12,9 +12,9 @@ import pycolmap
 import pytest
 
 from stages.io.photos import Photo
-from stages.sfm import global_mapping
+from stages.sfm import checked_mapping, global_mapping
 from stages.sfm.checked_mapping import Runs, _global_failure, _most_steps, _with_pieces_joined, calibrate_by_few
-from stages.sfm.colmap.database.calibration import set_focal_length
+from stages.sfm.colmap.database.calibration import Told, set_focal_length
 from stages.sfm.colmap.database.copies import copy_without_pairs
 from stages.sfm.colmap.database.images import fill_database
 from stages.sfm.colmap.database.matching import best_linked, match_pairs
@@ -25,7 +25,7 @@ from stages.sfm.colmap.model_check import (
 from stages.sfm.colmap.repair import (
     restricted,
 )
-from stages.sfm.retry_strategies import MappingOptions
+from stages.sfm.retry_strategies import STRATEGIES, MappingOptions
 from tests.stages.sfm.colmap.made_models import (
     FOCAL_PX,
     PHOTOS,
@@ -76,21 +76,50 @@ def strip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_best_linked_images_hang_together(strip: Path) -> None:
-    numbers = sorted(int(name.removesuffix(".png")) for name in best_linked(strip, 5))
+    numbers = sorted(int(name.removesuffix(".png")) for name in best_linked(strip, 5, {1}))
     assert numbers == list(range(numbers[0], numbers[0] + 5))
-    assert len(best_linked(strip, 50)) == STRIP_PHOTOS - 1, "the one that sees nothing is linked with none"
+    assert len(best_linked(strip, 50, {1})) == STRIP_PHOTOS - 1, "the one that sees nothing is linked with none"
 
 
 def test_few_photos_tell_focal_length_and_distortion(strip: Path, tmp_path: Path) -> None:
     job: Any = SimpleNamespace(seed=0, folder=str(tmp_path))
     state = SimpleNamespace(job=job, images=tmp_path, thinned=True, send=lambda **_: None)
     state.photos = [SimpleNamespace(camera_group=0)] * STRIP_PHOTOS
-    assert calibrate_by_few(strip, MappingOptions(), cast(Any, state))
+    assert calibrate_by_few(strip, MappingOptions(), Told(frozenset({1}), True), cast(Any, state)) == {1}
     with pycolmap.Database.open(strip) as db:
         camera = db.read_camera(1)
     assert camera.has_prior_focal_length
     focal_px, _, _, distortion = camera.params
     assert focal_px == pytest.approx(FOCAL, rel=0.005) and distortion == pytest.approx(DISTORTION, abs=0.005)
+
+
+@pytest.mark.parametrize(("photos", "told", "held"), [(8, True, {1}), (8, False, set()), (12, False, {1})])
+def test_beside_untold_cameras_only_those_of_many_photos_are_held(
+    photos: int, told: bool, held: set[int], strip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checked_mapping, "CALIBRATING_PHOTOS", photos)
+    job: Any = SimpleNamespace(seed=0, folder=str(tmp_path))
+    state = cast(Any, SimpleNamespace(job=job, images=tmp_path, thinned=True, send=lambda **_: None))
+    assert calibrate_by_few(strip, MappingOptions(), Told(frozenset({1}), told), state) == held
+    assert best_linked(strip, 50, {2})[1:] == [], "links with photos of other cameras do not count"
+
+
+@pytest.mark.parametrize("everything", [True, False])
+def test_an_untold_camera_leaves_the_others_held(
+    everything: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mapped = []
+    monkeypatch.setattr(checked_mapping, "thin_matches", lambda *_, **__: Told(frozenset({1}), everything))
+    monkeypatch.setattr(checked_mapping, "calibrate_by_few", lambda *_: {1})
+    monkeypatch.setattr(checked_mapping, "_start_global_mapping", lambda *_: None)
+    monkeypatch.setattr(checked_mapping, "_map_incrementally", lambda _, options, __: mapped.append(options))
+    job = SimpleNamespace(seed=0, camera_params=None, folder=str(tmp_path))
+    ways: Any = dict.fromkeys(("begin", "end"), lambda *_, **__: None) | {"sibling": lambda name: tmp_path / name}
+    state: Any = SimpleNamespace(job=job, thinned=True, photos=[SimpleNamespace(camera_group=0)], **ways)
+    checked_mapping.run_mapping(STRATEGIES[0], tmp_path / "a.db", state)
+    (options,) = mapped
+    assert options.ba_refine_focal_length != everything
+    assert options.constant_cameras == options.mapper.constant_cameras == (set() if everything else {1})
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -18,10 +19,17 @@ TOLD_DIGITS = 6
 MAX_EXIF_RATIO = 1.3
 
 
-def calibrate_focal_lengths(database: Path) -> bool:
+class Told(NamedTuple):
+    """The cameras (ids) whose focal lengths the pairs tell, and whether these are all of them."""
+
+    cameras: frozenset[int] = frozenset()
+    all: bool = False
+
+
+def calibrate_focal_lengths(database: Path) -> Told:
     """Focal lengths under which most fundamental matrices are essential ones (Sweeney et al. 2015, "Optimizing the
     viewing graph for structure-from-motion"), where EXIF tells none or one that is far from it: that of a cropped
-    photo. Returns whether they are told for every camera.
+    photo. Returns for which cameras they are told.
 
     They are believed where short and long ones to begin with lead to the same: photos whose axes meet in one point do
     not tell them (Newsam et al. 1996, "Recovering unknown focal lengths in self-calibration"), planes neither. Nothing
@@ -30,7 +38,7 @@ def calibrate_focal_lengths(database: Path) -> bool:
     with pycolmap.Database.open(database) as db:
         cameras = db.read_all_cameras()
     if any(camera.model_name.endswith("FISHEYE") for camera in cameras):
-        return False  # two views through it have no fundamental matrix
+        return Told()  # two views through it have no fundamental matrix
     by_short, by_long = (_calibrated(database, factor) for factor in CALIBRATION_STARTS)
     told = {
         camera: float(f"{math.sqrt(short * long):.{TOLD_DIGITS}g}")
@@ -45,7 +53,7 @@ def calibrate_focal_lengths(database: Path) -> bool:
             set_focal_length(camera, focal_px)
             camera.has_prior_focal_length = True
             db.update_camera(camera)
-    return len(told) == len(cameras)
+    return Told(frozenset(told), len(told) == len(cameras))
 
 
 def _calibrated(database: Path, factor: float) -> dict[int, float]:

@@ -94,12 +94,10 @@ def fisheye_focal_px(width: int, height: int) -> float:
     return math.hypot(width, height) / math.radians(FISHEYE_ANGLE_DEG)
 
 
-def adopt_cameras(database: Path, model: pycolmap.Reconstruction, image_ids: Iterable[int]) -> set[int]:
-    """Give the cameras of these images the intrinsics that they have in the model, as known; the ids of the cameras."""
-    camera_ids = {model.image(image_id).camera_id for image_id in image_ids}
+def adopt_cameras(database: Path, model: pycolmap.Reconstruction, camera_ids: Iterable[int]) -> None:
+    """Give these cameras the intrinsics that they have in the model, as known."""
     with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
         for camera_id in sorted(camera_ids):
             camera = pycolmap.Camera(model.camera(camera_id).todict())
             camera.has_prior_focal_length = True
             db.update_camera(camera)
-    return camera_ids

@@ -1,7 +1,7 @@
 """Matching and verification of pairs of photos, and what is matched so far."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from itertools import chain, islice, takewhile
@@ -154,13 +154,14 @@ def matched_pairs(database: Path) -> Pairs:
     return image_pairs(ids) - 1
 
 
-def best_linked(database: Path, count: int) -> list[str]:
-    """The names of so many images that hang together by the most verified matches: the one that has most, then again
-    and again the one that has most with those taken. Fewer where no other is linked with them."""
+def best_linked(database: Path, count: int, cameras: Collection[int]) -> list[str]:
+    """The names of so many images of these cameras (ids) that hang together by the most verified matches: the one that
+    has most, then again and again the one that has most with those taken. Fewer where no other is linked with them."""
     with pycolmap.Database.open(database) as db:
-        names = [image.name for image in sorted(db.read_all_images(), key=lambda image: image.image_id)]
+        images = sorted(db.read_all_images(), key=lambda image: image.image_id)
         pair_ids, inliers = db.read_two_view_geometry_num_inliers()
-    graph = inlier_matrix(len(names), image_pairs(pair_ids) - 1, np.array(inliers, int))
-    strength = np.maximum(graph, 0)  # none where none was tried
+    graph = inlier_matrix(len(images), image_pairs(pair_ids) - 1, np.array(inliers, int))
+    of_these = np.array([image.camera_id in cameras for image in images])
+    strength = np.where(of_these[:, None] & of_these, np.maximum(graph, 0), 0)  # none where none was tried
     linked = takewhile(lambda one: one.links > 0, most_linked(strength))
-    return [names[photo] for photo, _ in islice(linked, count)]
+    return [images[photo].name for photo, _ in islice(linked, count)]

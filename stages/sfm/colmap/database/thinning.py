@@ -13,7 +13,7 @@ from jaxtyping import Bool, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from stages.sfm.colmap.database.calibration import calibrate_focal_lengths
+from stages.sfm.colmap.database.calibration import Told, calibrate_focal_lengths
 from stages.sfm.colmap.database.copies import keep_inliers
 from stages.sfm.colmap.database.correspondences import Correspondences, read_correspondences
 from stages.sfm.colmap.database.features import read_keypoints
@@ -24,26 +24,26 @@ TRACKS_PER_PHOTO = 500  # of mapping: 1,000 take 1.7 times as long and move no c
 CELLS_ACROSS = 4
 
 
-def thin_matches(database: Path, copy: Path, tracks: int = TRACKS_PER_PHOTO, *, camera_is_known: bool = False) -> bool:
+def thin_matches(database: Path, copy: Path, tracks: int = TRACKS_PER_PHOTO, *, camera_is_known: bool = False) -> Told:
     """Copy the database with the verified matches of each photo's best ``tracks`` tracks alone.
 
     Focal lengths are calibrated by all pairs together in the copy, unless the camera is known: mapping that begins with
     a guess that is a fifth off can take minutes to leave it, or end with intrinsics that project everything wrongly.
-    Returns whether the pairs tell that of every camera.
+    Returns for which cameras the pairs tell that.
     """
     with unfinished_copy(database, copy) as unfinished:
         with pycolmap.Database.open(unfinished) as db:
             geometries = dict(zip(*db.read_two_view_geometries(), strict=True))
             matches = read_correspondences(db, geometries)
             cells = _cells(db, len(matches.begins) - 1)
-        calibrated = not camera_is_known and calibrate_focal_lengths(unfinished)
+        told = Told() if camera_is_known else calibrate_focal_lengths(unfinished)
         kept = best_tracks(matches, cells, tracks)[matches.keypoint[:, 0]]
         bounds = np.searchsorted(matches.pair, np.arange(len(matches.pairs) + 1))
         with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
             for number, (first, second) in enumerate(matches.pairs.tolist()):
                 geometry = geometries[pycolmap.image_pair_to_pair_id(first, second)]
                 keep_inliers(db, (first, second), geometry, kept[bounds[number] : bounds[number + 1]])
-    return calibrated
+    return told
 
 
 def _cells(db: pycolmap.Database, photos: int) -> Int[np.ndarray, "keypoints"]:

@@ -57,7 +57,8 @@ def test_only_adopted_cameras_are_held(tmp_path: Path) -> None:
         for camera in db.read_all_cameras():
             camera.focal_length = 1.1 * FOCAL_PX
             db.update_camera(camera)
-    held = adopt_cameras(made.database, made.model, range(1, 12))
+    held = {made.model.image(image_id).camera_id for image_id in range(1, 12)}
+    adopt_cameras(made.database, made.model, held)
     assert len(held) == 11
     options = incremental_options(0, MappingOptions(), camera_is_known=False, thinned=True, held_cameras=held)
     (model,) = map_incrementally(made.database, tmp_path, tmp_path / "models", options)
