@@ -190,7 +190,7 @@ def _line(registration: dict[str, Any]) -> str:
 STAGE = Stage(
     name="sfm",
     inputs=("ingest",),
-    version=33,
+    version=34,
     exit_code=11,
     resumes=True,
     published=("sparse", "registration.json"),

@@ -56,9 +56,8 @@ def match_photos(strategy: Strategy, missing: list[int], state: JobState) -> tup
         graph = _match_all(database, state)
     elif strategy.matches in ("missing", "relaxed"):
         database = state.sibling(strategy.matches)
-        before, partners = matched_pairs(state.latest()), 2 * job.neighbours
-        if strategy.matches == "relaxed":  # of many photos: together as many pairs as were matched already
-            partners = max(partners, len(before) // len(missing))
+        before = matched_pairs(state.latest())
+        partners = relaxed_partners(strategy, job.neighbours, len(before), len(missing))
         copy_without_matches_of({state.files[number] for number in missing}, state.latest(), database)
         _match(database, with_more_pairs(before, missing, partners, lambda: state.similarity), RELAXED_RATIO, state)
     elif strategy.matches == "consecutive":
@@ -76,6 +75,23 @@ def match_photos(strategy: Strategy, missing: list[int], state: JobState) -> tup
         _extract(database, twice, state)
         graph = _match_all(database, state)
     return database, graph
+
+
+def relaxed_partners(strategy: Strategy, neighbours: int, matched: int, missing: int) -> int:
+    """How many photos each of the ``missing`` ones is matched with again, where pairs are chosen and so many were
+    ``matched`` already."""
+    if strategy.matches == "missing":
+        return 2 * neighbours
+    return max(2 * neighbours, matched // missing)  # few: together as many pairs as were matched already
+
+
+def relaxed_pairs(strategy: Strategy, missing: int, matched: int, state: JobState) -> float:
+    """About how many pairs that will be, a pair of missing photos counted once."""
+    photos = len(state.photos)
+    partners = photos - 1
+    if state.job.matcher != "exhaustive":
+        partners = min(partners, relaxed_partners(strategy, state.job.neighbours, matched, missing))
+    return missing * partners * (1 - missing / photos / 2)
 
 
 def _extract(database: Path, extraction: ExtractionOptions, state: JobState) -> None:
@@ -167,6 +183,6 @@ def _match(database: Path, pairs: Pairs, max_ratio: float, state: JobState) -> N
 
     expected = expected_pairs(state.job.matcher, len(state.photos), state.job.neighbours)
     state.begin("matching", database=str(database), pairs=max(len(pairs), expected))
-    exact = state.job.matcher == "exhaustive" or max_ratio != STRICT_RATIO
+    exact = state.job.matcher == "exhaustive"
     match_pairs(database, pairs, state.job.seed, max_ratio, expect, None if exact else state.features(database))
     state.end("matching")

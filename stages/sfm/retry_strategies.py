@@ -21,6 +21,7 @@ MIN_LONG_FOCAL = 1.0
 # Camera model selection and final bundle adjustment take 0.8 to 1.6 times as long as mapping
 # (docs/experiments/camera_models.md).
 FINAL_ADJUSTMENT_FACTOR = 2.0
+RELAXED_COST = 2.0  # of matching a pair by the relaxed ratio: its mismatches take longer to verify
 ADDING = 0.4  # of the time of mapping, that a few images take to be registered in its model
 MAX_SECONDS_LIMIT, TIME_GIVEN = "--sfm.max-seconds", "the time it is given (--budget or --sfm.seconds)"
 LOG, ABANDONED = "outcomes.json", "abandoned.json"
@@ -199,26 +200,22 @@ def read_kept(path: Path) -> Any:
     return json.loads(path.read_bytes()) if path.exists() else []
 
 
-def expected_seconds(strategy: Strategy, outcomes: Sequence[Outcome], missing: float, chosen_pairs: bool) -> float:
-    """How long a strategy will take, by what those before it took. ``missing``: the fraction of images unregistered.
+def expected_seconds(strategy: Strategy, outcomes: Sequence[Outcome], rematched: float) -> float:
+    """How long a strategy will take, by what those before it took. ``rematched``: the pairs that it matches by a
+    relaxed ratio test, over those that were matched first.
 
     Mapping takes as long as it did at most; it is over sooner where nothing more is found. New features are extracted
     from four times the pixels and are twice as many, which is four times the matching and twice the mapping.
     """
     first = outcomes[0].seconds
     mapping = max(one.seconds["mapping"] for one in outcomes)
+    relaxed = RELAXED_COST * rematched * first["matching"]
     if strategy.matches == "missing":
-        return min(1.0, 4 * missing) * first["matching"] + ADDING * mapping
+        return relaxed + ADDING * mapping
     if strategy.matches == "more features":
         return 4 * (first["features"] + first["matching"]) + 2 * mapping
-    # A missing image's pairs are matched again, or where pairs were chosen as many as the first time.
-    again = {
-        "same": 0.0,
-        "consecutive": 0.0,
-        "fisheye": 1.0,
-        "relaxed": 1.0 if chosen_pairs else 1 - (1 - missing) ** 2,
-    }
-    return again[strategy.matches] * first["matching"] + mapping
+    again = {"same": 0.0, "consecutive": 0.0, "fisheye": first["matching"], "relaxed": relaxed}
+    return again[strategy.matches] + mapping
 
 
 def exceeds_time(expected: float, outcomes: Sequence[Outcome], left: float) -> bool:

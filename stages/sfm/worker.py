@@ -19,12 +19,13 @@ from stages.io.amounts import rough_duration
 from stages.io.files import make_durable
 from stages.sfm.checked_mapping import register_missing, run_mapping
 from stages.sfm.colmap.adjustment.final_bundle_adjustment import final_bundle_adjustment
+from stages.sfm.colmap.database.matching import matched_pairs
 from stages.sfm.colmap.diagnosis import find_conflict, links, supports
 from stages.sfm.colmap.model_check import check_model, facts, reasons
 from stages.sfm.colmap.models import load_native, turned_upright, write_native
 from stages.sfm.colmap.repair import deregister
 from stages.sfm.job import Job, JobState, Send, end_with_parent
-from stages.sfm.matching import capture_sequence, match_photos
+from stages.sfm.matching import capture_sequence, match_photos, relaxed_pairs
 from stages.sfm.retry_strategies import (
     MIN_LONG_FOCAL,
     STRATEGIES,
@@ -37,6 +38,8 @@ from stages.sfm.retry_strategies import (
     expected_seconds,
     reason_against,
 )
+
+MIN_SECONDS_SAID = 30.0  # that a strategy takes, to be worth a word
 
 
 def main() -> None:
@@ -146,7 +149,9 @@ def _try_strategies(state: JobState) -> None:
             why = f"{len(missing)} of {len(state.photos)} photos {are} unregistered"
             if _is_misfit(state):
                 why = "the cameras do not fit the verified matches"
-            state.send(note=Note("sfm.strategy", f"{why}: {strategy.description}"))
+            takes = _expected(strategy, missing, state)
+            duration = f" (about {rough_duration(takes)})" if takes >= MIN_SECONDS_SAID else ""
+            state.send(note=Note("sfm.strategy", f"{why}: {strategy.description}{duration}"))
             _try(strategy, missing, state)
     for why, descriptions in unsaid.items():
         state.send(note=Note("sfm.strategy-useless", f"not tried, because {why}: {'; '.join(descriptions)}"))
@@ -184,8 +189,7 @@ def _why_infeasible(strategy: Strategy, missing: list[int], state: JobState) -> 
             note=Note("sfm.strategy-failed-before", f"not tried, because {ended.why} last time: {strategy.description}")
         )
         return ended
-    outcomes, (left, limit), chosen_pairs = state.log.outcomes, state.left(), state.job.matcher != "exhaustive"
-    expected = expected_seconds(strategy, outcomes, len(missing) / len(state.photos), chosen_pairs)
+    outcomes, (left, limit), expected = state.log.outcomes, state.left(), _expected(strategy, missing, state)
     if not exceeds_time(expected, outcomes, left):
         return None
     rest = f"{rough_duration(max(0.0, left))} of {limit} are left"
@@ -196,6 +200,15 @@ def _why_infeasible(strategy: Strategy, missing: list[int], state: JobState) -> 
     times = f"about {rough_duration(expected)} and the final bundle adjustment, and only {rest}"
     state.send(note=Note("sfm.strategy-too-slow", f"not tried, because it takes {times}: {strategy.description}"))
     return Skip(f"too little was left of {limit}", for_time=True)
+
+
+def _expected(strategy: Strategy, missing: list[int], state: JobState) -> float:
+    """How many seconds the strategy will take."""
+    rematched = 0.0
+    if strategy.matches in ("missing", "relaxed"):
+        matched = len(matched_pairs(state.database))
+        rematched = relaxed_pairs(strategy, len(missing), matched, state) / max(1, matched)
+    return expected_seconds(strategy, state.log.outcomes, rematched)
 
 
 def _try(strategy: Strategy, missing: list[int], state: JobState) -> None:

@@ -23,6 +23,9 @@ from stages.sfm.pairs.pair_selection import Pairs
 # finds views that lie farther apart; only photos that otherwise stay unregistered are matched like that.
 STRICT_RATIO = 0.8
 RELAXED_RATIO = 0.9
+# Of a pair's verification, in place of COLMAP's 10,000: among so many mismatches nearly every pair would take them all.
+# It is five times as fast, and one verified pair in sixty is lost (docs/experiments/few_features.md).
+RELAXED_TRIALS = 1000
 BLOCK_SIZE = 32  # pairs of photos that are worked on and committed at once (progress, resuming)
 
 
@@ -93,6 +96,8 @@ Matched = tuple[np.ndarray, pycolmap.TwoViewGeometry]
 
 def _match_block(max_ratio: float, seed: int, block: Block) -> list[Matched]:
     options, photos = _verification(seed), {each: each() for pair in block for each in pair}
+    if max_ratio > STRICT_RATIO:
+        options.ransac.max_num_trials = RELAXED_TRIALS
     return [_match(photos[first], photos[second], max_ratio, options) for first, second in block]
 
 

@@ -65,6 +65,16 @@ def test_verified_matches_are_those_of_colmaps_own_verification(database: Path) 
     assert {pair: rest for pair, (_, *rest) in ours.items()} == {pair: rest for pair, (_, *rest) in theirs.items()}
 
 
+@pytest.mark.parametrize(("ratio", "trials"), [(0.8, 10_000), (0.9, matching.RELAXED_TRIALS)])
+def test_verification_of_relaxed_matches_ends_sooner(
+    ratio: float, trials: int, database: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    allowed, real = set[int](), matching._verified
+    monkeypatch.setattr(matching, "_verified", lambda *args: allowed.add(args[-1].ransac.max_num_trials) or real(*args))
+    match_pairs(database, exhaustive(COUNT), 0, ratio)
+    assert allowed == {trials}
+
+
 def test_the_number_of_cores_changes_nothing(database: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     results = []
     for cores in (1, 4):
