@@ -21,7 +21,7 @@ RETRY = next(strategy for strategy in STRATEGIES if strategy.matches == "missing
 SFM_INSTANTS = {
     "features": lambda event: event.get("done") is not None,
     "matching": lambda event: event["event"] == "note" and event["message"].startswith("matching "),
-    RETRY.name: lambda event: event.get("code") == "sfm.strategy" and event["message"].endswith(RETRY.description),
+    RETRY.name: lambda event: event.get("code") == "sfm.strategy" and RETRY.description in event["message"],
     "final bundle adjustment": lambda event: event.get("done") == REFINING,
 }
 
