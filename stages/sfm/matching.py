@@ -48,18 +48,20 @@ from stages.sfm.retry_strategies import Strategy
 def match_photos(strategy: Strategy, missing: list[int], state: JobState) -> tuple[Path, dict[str, Any] | None]:
     """The database with the matches that the strategy maps, and what is known of their graph where it was grown."""
     job, database, graph = state.job, state.database, None
+    exact = job.matcher == "exhaustive"
     if strategy.matches == "same":
         best = state.usable()
         return state.latest(), best.match_graph if best else None
     if strategy.matches == "strict":
         _extract(database, ExtractionOptions(job.max_image_size, job.max_features), state)
-        graph = _match_all(database, state)
+        graph = _match_all(database, exact, state)
     elif strategy.matches in ("missing", "relaxed"):
         database = state.sibling(strategy.matches)
         before = matched_pairs(state.latest())
         partners = relaxed_partners(strategy, job.neighbours, len(before), len(missing))
         copy_without_matches_of({state.files[number] for number in missing}, state.latest(), database)
-        _match(database, with_more_pairs(before, missing, partners, lambda: state.similarity), RELAXED_RATIO, state)
+        pairs = with_more_pairs(before, missing, partners, lambda: state.similarity)
+        _match(database, pairs, RELAXED_RATIO, exact, state)
     elif strategy.matches == "consecutive":
         database = state.sibling("consecutive")
         tried, kept = (matched_pairs(state.database) + 1).tolist(), consecutive_pairs(state)
@@ -73,7 +75,7 @@ def match_photos(strategy: Strategy, missing: list[int], state: JobState) -> tup
             2 * job.max_image_size, 2 * job.max_features, doubled_up_to=job.max_image_size, even_contrast=True
         )
         _extract(database, twice, state)
-        graph = _match_all(database, state)
+        graph = _match_all(database, False, state)  # exactly would take minutes, and find two in a hundred more
     return database, graph
 
 
@@ -115,14 +117,14 @@ def _note_few_features(state: JobState, median: float, chosen: ExtractionOptions
     state.send(note=note)
 
 
-def _match_all(database: Path, state: JobState) -> dict[str, Any] | None:
+def _match_all(database: Path, exact: bool, state: JobState) -> dict[str, Any] | None:
     """Match every pair, or grow the match graph: round by round, where verification says that it pays.
 
     Returns how many pairs were tried and verified, and whether the order of names or times helped to choose them.
     """
     job, count, priors = state.job, len(state.photos), capture_priors(state.photos)
     if job.matcher == "exhaustive":
-        _match(database, exhaustive(count), STRICT_RATIO, state)
+        _match(database, exhaustive(count), STRICT_RATIO, exact, state)
         return None
     orders = candidate_orders(state.photos)
     pairs = union(
@@ -131,7 +133,7 @@ def _match_all(database: Path, state: JobState) -> dict[str, Any] | None:
     )
 
     def tried() -> np.ndarray:
-        _match(database, pairs, STRICT_RATIO, state)
+        _match(database, pairs, STRICT_RATIO, exact, state)
         return inlier_matrix(count, pairs, verified_matches(database, pairs))
 
     inliers = tried()
@@ -172,7 +174,9 @@ def consecutive_pairs(state: JobState) -> set[tuple[int, int]]:
     return {(min(pair), max(pair)) for pair in pairwise(capture_sequence(state.database, state))}
 
 
-def _match(database: Path, pairs: Pairs, max_ratio: float, state: JobState) -> None:
+def _match(database: Path, pairs: Pairs, max_ratio: float, exact: bool, state: JobState) -> None:
+    """Match these pairs, every feature with every other (``exact``) or by an inverted file."""
+
     def expect(left: int, seconds: float) -> None:
         if state.job.matcher == "exhaustive":
             state.send(
@@ -183,6 +187,5 @@ def _match(database: Path, pairs: Pairs, max_ratio: float, state: JobState) -> N
 
     expected = expected_pairs(state.job.matcher, len(state.photos), state.job.neighbours)
     state.begin("matching", database=str(database), pairs=max(len(pairs), expected))
-    exact = state.job.matcher == "exhaustive"
     match_pairs(database, pairs, state.job.seed, max_ratio, expect, None if exact else state.features(database))
     state.end("matching")

@@ -1,4 +1,4 @@
-"""How the worker matches: which features are compared, and how many pairs a relaxed ratio test takes."""
+"""How the worker matches: how features are compared, and how many pairs a relaxed ratio test takes."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,28 +8,38 @@ import numpy as np
 import pytest
 
 from stages.sfm import matching
-from stages.sfm.colmap.database.matching import RELAXED_RATIO, STRICT_RATIO
-from stages.sfm.matching import relaxed_pairs
 from stages.sfm.retry_strategies import STRATEGIES
 
 BY_NAME = {strategy.name: strategy for strategy in STRATEGIES}
 
 
 def state_of(photos: int, matcher: str) -> Any:
-    said = SimpleNamespace(begin=lambda *_, **__: None, end=lambda _: None)
-    job = SimpleNamespace(matcher=matcher, neighbours=30, seed=0)
-    return SimpleNamespace(photos=[None] * photos, job=job, features=lambda _: "indexed", **vars(said))
+    job = SimpleNamespace(matcher=matcher, neighbours=30, max_image_size=1600, max_features=4096)
+    databases = {"database": Path("m.db"), "latest": lambda: Path("m.db"), "sibling": Path}
+    return SimpleNamespace(job=job, photos=[None] * photos, files=[""] * photos, **databases)
 
 
-@pytest.mark.parametrize("ratio", [STRICT_RATIO, RELAXED_RATIO])
-@pytest.mark.parametrize(("matcher", "features"), [("exhaustive", None), ("retrieval", "indexed")])
-def test_chosen_pairs_are_compared_by_the_inverted_file(
-    matcher: str, features: str | None, ratio: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("matcher", "name", "compared"),
+    [
+        ("exhaustive", "default", "exactly"),
+        ("retrieval", "default", "by the inverted file"),
+        ("exhaustive", "relaxed ratio test", "exactly"),
+        ("retrieval", "relaxed ratio test", "by the inverted file"),
+        ("exhaustive", "more features", "by the inverted file"),
+    ],
+)
+def test_many_pairs_or_features_are_compared_by_the_inverted_file(
+    matcher: str, name: str, compared: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    given: list[Any] = []
-    monkeypatch.setattr(matching, "match_pairs", lambda *args: given.extend(args))
-    matching._match(tmp_path / "m.db", np.array([[0, 1]]), ratio, state_of(2, matcher))
-    assert given[3] == ratio and given[5] == features
+    given: list[bool] = []
+    monkeypatch.setattr(matching, "_extract", lambda *_: None)
+    monkeypatch.setattr(matching, "_match_all", lambda _, exact, __: given.append(exact))
+    monkeypatch.setattr(matching, "_match", lambda _, __, ___, exact, ____: given.append(exact))
+    monkeypatch.setattr(matching, "matched_pairs", lambda _: np.array([[0, 1], [0, 2], [1, 2]]))
+    monkeypatch.setattr(matching, "copy_without_matches_of", lambda *_: None)
+    matching.match_photos(BY_NAME[name], [2], state_of(3, matcher))
+    assert given == [compared == "exactly"]
 
 
 @pytest.mark.parametrize(
@@ -44,4 +54,6 @@ def test_chosen_pairs_are_compared_by_the_inverted_file(
 def test_pairs_of_a_relaxed_ratio_test_are_foreseen(
     name: str, photos: int, matcher: str, missing: int, matched: int, pairs: int
 ) -> None:
-    assert relaxed_pairs(BY_NAME[name], missing, matched, state_of(photos, matcher)) == pytest.approx(pairs, rel=0.1)
+    assert matching.relaxed_pairs(BY_NAME[name], missing, matched, state_of(photos, matcher)) == pytest.approx(
+        pairs, rel=0.1
+    )
