@@ -17,7 +17,7 @@ from stages import train
 from stages.contract import Inputs, Progress, plan_stage
 from stages.effects.decisions import Space, read_decisions
 from stages.hardware.device import processors
-from stages.io.amounts import resolution_name
+from stages.io.amounts import counted, resolution_name
 from stages.io.ascii_names import shell_quoted
 from stages.io.pixels import load_view
 from stages.train.config import FieldName
@@ -173,10 +173,10 @@ class Run(NamedTuple):
 
 
 class Schedule(NamedTuple):
-    """The runs of a study in order, and in words those that the time does not allow."""
+    """The runs of a study in order, and those that the time does not allow."""
 
     runs: tuple[Run, ...]
-    left_out: tuple[str, ...]
+    left_out: tuple[Run, ...]
 
     @property
     def seconds(self) -> float:
@@ -285,7 +285,7 @@ def make_schedule(
         else:
             runs[run.name] = run
             left -= run.seconds
-    return Schedule(tuple(runs.values()), list_runs(tuple(left_out.values())))
+    return Schedule(tuple(runs.values()), tuple(left_out.values()))
 
 
 def _run(
@@ -335,7 +335,7 @@ def list_runs(runs: Sequence[Run]) -> tuple[str, ...]:
         for (variant, downscale, too_few), steps in groups.items()
     ]
     seeds = sum(run.seed > 0 for run in runs)
-    return (*words, *([f"{seeds} runs with further seeds"] if seeds else []))
+    return (*words, *([f"{counted(seeds, 'run')} with further seeds"] if seeds else []))
 
 
 # --- how fast this machine is, and which photo sizes that calls for

@@ -164,7 +164,7 @@ def schedule_lines(schedule: Schedule, seconds: float, runs: Path) -> list[str]:
             seeds = f"{len(chosen)} runs" if len(chosen) > settings else "one seed each"
             lines.append(f"{variant}: {settings} × {span} steps at {sizes}, {seeds}, {share:.0%} of the time")
     if schedule.left_out:
-        lines.append(f"left out for lack of time: {'; '.join(schedule.left_out)}")
+        lines.append(f"left out for lack of time: {'; '.join(list_runs(schedule.left_out))}")
     return lines
 
 
@@ -213,7 +213,7 @@ def run_study(config: "Config", inputs: Inputs, folder: Path, progress: Progress
             raise StageError("tradeoff.no-result", "the study has no result", why, "Correct what stopped the runs.")
         last = _RunProgress(progress, WORKSPACE_FIELD, spent() / config.seconds)
         existing = score_workspace_field(benchmark, inputs, runs, config.seconds, last)
-    return Outcome(results, (*schedule.left_out, *list_runs(late), *failed), existing, benchmark)
+    return Outcome(results, (*list_runs((*schedule.left_out, *late)), *failed), existing, benchmark)
 
 
 @dataclass(frozen=True)
