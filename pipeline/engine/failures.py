@@ -8,7 +8,7 @@ from pathlib import Path
 from stages.contract import StageError
 from stages.io.files import read_json, write_durably
 
-FAILURE = "failure.json"  # in a partial folder: what ended the last attempt at the stage
+FAILURE = "failure.json"  # in a partial folder: what ended the last attempt at the stage, or at its plan
 
 
 class StageFailed(Exception):
@@ -51,15 +51,18 @@ def _disk_error(error: OSError) -> StageError:
 
 
 @contextmanager
-def recorded(partial: Path) -> Iterator[None]:
-    """What a stage fails of is written into its partial folder, for ``status``; that of an earlier attempt goes."""
+def recorded(stage: str, partial: Path) -> Iterator[None]:
+    """What ``stage`` fails of, raised as StageFailed, is written into a partial folder, for ``status``; that of an
+    earlier attempt goes."""
     file = partial / FAILURE
     file.unlink(missing_ok=True)
     try:
-        yield
-    except StageError as error:
+        with worded(stage):
+            yield
+    except StageFailed as failure:
         with suppress(OSError):  # the failure itself matters more
-            write_durably(file, json.dumps({"code": error.code, "what": error.what}).encode())
+            partial.mkdir(parents=True, exist_ok=True)
+            write_durably(file, json.dumps({"code": failure.error.code, "what": failure.error.what}).encode())
         raise
 
 

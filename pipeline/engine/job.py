@@ -12,11 +12,12 @@ class DamagedInputs(Exception):
 
 
 class NotReady(Exception):
-    """A stage's key cannot be known yet: ``upstream`` (or the stage itself) has no current result or plan."""
+    """A stage's key cannot be known yet: ``upstream`` (or the stage itself) has no current result or plan. ``asked``:
+    the digest of what the stage's plan would answer, where it is the plan that is missing."""
 
-    def __init__(self, upstream: str) -> None:
+    def __init__(self, upstream: str, asked: str = "") -> None:
         super().__init__(upstream)
-        self.upstream = upstream
+        self.upstream, self.asked = upstream, asked
 
 
 @dataclass(frozen=True)

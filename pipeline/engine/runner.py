@@ -294,12 +294,13 @@ class Runner:
             now |= {*declared.not_hashed} - {"seconds"}
             return declared.config.model_validate(plans[asked] | options.model_dump(include=now))
         if not may_plan:
-            raise NotReady(stage)
+            raise NotReady(stage, asked)
         self._check_inputs(stage, folders)
         self.budget.begin(stage, self.times.get(stage))
-        clock = time.monotonic()
-        with counting(self.workspace.root / RUNNING):
+        clock, unplanned = time.monotonic(), self.workspace.partial(stage, asked)
+        with recorded(stage, unplanned), counting(self.workspace.root / RUNNING):
             config = plan_stage(declared, self._with_time(stage, options), folders, self.display)
+        shutil.rmtree(unplanned, ignore_errors=True)
         self.planning[stage] = time.monotonic() - clock
         plans[asked] = config.model_dump(mode="json")
         self.workspace.write_run(self.run_file)
@@ -349,7 +350,7 @@ class Runner:
         self.workspace.write_run(self.run_file)
         started = datetime.now(UTC)
         self.running = name
-        with recorded(partial), counting(self.workspace.root / RUNNING), counting(partial / ATTEMPTS) as spent:
+        with recorded(name, partial), counting(self.workspace.root / RUNNING), counting(partial / ATTEMPTS) as spent:
             result = stage.run(job.config, job.folders, partial, self.display)
         outputs = manifests.describe_outputs(partial, result.outputs)
         manifest = Manifest(

@@ -41,17 +41,19 @@ def last_result(workspace: Workspace, runner: Runner, stage: str) -> Manifest | 
 def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = False) -> StageStatus:
     """How ``stage`` stands for the recorded options; ``deep``: its files are read and compared with their sha256."""
     last = last_result(workspace, runner, stage)
+    command = command_that_makes(stage, runner.run_file.stages, workspace.root)
     try:
         job = runner.resolve(stage, may_plan=False)
     except NotReady as waiting:
         reason = f"waits for {waiting.upstream}"
         if waiting.upstream == stage:
+            if failure := last_failure(workspace.partial(stage, waiting.asked)):
+                return StageStatus(stage, "failed", f"{failure}; `{command}` tries again")
             reason = _why_unplanned(runner, stage, last) if last else ""
         return StageStatus(stage, "stale" if last else "never", reason)
     except StageError as error:
         return StageStatus(stage, "stale" if last else "never", f"{error.what}: {error.why}")
     folder = workspace.folder(stage, job.key)
-    command = command_that_makes(stage, runner.run_file.stages, workspace.root)
     try:
         manifest = manifests.read(folder)
         manifests.check_outputs(folder, manifest, deep)

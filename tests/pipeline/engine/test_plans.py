@@ -15,6 +15,7 @@ from pipeline.engine.runner import Runner
 from pipeline.engine.status import explain, status_of
 from pipeline.engine.workspace import Workspace
 from pipeline.schedule.forecast import Forecast
+from stages.contract import StageError
 from stages.io.files import read_json
 from tests.pipeline.engine import fake_stages
 from tests.pipeline.engine.fake_stages import FakeSettings, calls, declare
@@ -89,6 +90,27 @@ def test_status_explains_stale_stages_without_a_plan(
         assert (found.state, found.text) == ("stale", why)
         assert explain(workspace, runner, "sfm")[1].startswith("It would run, unless a finished result has its key")
         assert explain(workspace, runner, "train")[1].endswith("known when sfm has run.")
+
+
+def test_status_shows_what_a_plan_failed_of(bring: Bring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.engine.status.STAGES", fake_stages.STAGES)
+
+    def fail(*_: Any) -> None:
+        raise StageError("sfm.fake", "too little memory", "it was told to", "Do not tell it to.")
+
+    def found(**sfm: Any) -> tuple[str, str]:
+        given = {"ingest": {"photos": tmp_path / "photos"}, "sfm": sfm}
+        runner = Runner(Workspace(tmp_path / "w.nerf"), FakeSettings.model_validate(given), SilentDisplay())  # type: ignore[arg-type]
+        said = status_of(runner.workspace, runner, "sfm")
+        return said.state, said.text
+
+    with monkeypatch.context() as patch, pytest.raises(StageFailed):
+        declare(patch, "sfm", plan=fail)
+        bring()
+    assert found() == ("failed", f"too little memory; `pipeline resume {tmp_path / 'w.nerf'}` tries again")
+    assert found(fail=True) == ("never", ""), "these options were not tried"
+    bring()
+    assert found() == ("cached", "doubled") and not [*(tmp_path / "w.nerf/sfm").glob("*.partial")]
 
 
 def test_a_run_replans_its_stages_and_one_stage_alone_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
