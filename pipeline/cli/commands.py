@@ -291,6 +291,8 @@ def _run_stages(
         root = root.absolute()  # machines of a cluster work in folders of their own
     with Workspace(root) as workspace, cluster.joined(common.cluster, [root]):
         runner = Runner(workspace, settings, display)
+        shown = (name for name in runner.run_file.keys if stage_list.STAGES[name].summary and name not in stages)
+        stages = [*stages, *shown]  # a report that exists goes with what it shows
         if new_budget is not None:
             runner.budget.set_total(*new_budget)
         replan = (stages if alone is None else (alone,)) if common.replan else ()
@@ -303,7 +305,7 @@ def _run_stages(
         except StageFailed as failure:
             display.failed(failure.stage, failure.error)
             raise
-        words = _closing_words(workspace, ran)
+        words = _closing_words(runner, stages, ran, alone)
         if runner.budget.charged and alone is None and (account := runner.budget.account):
             words = f"{duration(account.seconds_spent)} of {duration(account.total)} spent {words}"
         display.finished(words, _outputs(workspace))
@@ -315,11 +317,18 @@ def _outputs(workspace: Workspace) -> dict[str, Path]:
     return {path.name: path for path in sorted(folder.iterdir())} if folder.is_dir() else {}
 
 
-def _closing_words(workspace: Workspace, ran: bool) -> str:
+def _closing_words(runner: Runner, stages: Sequence[str], ran: bool, alone: str | None) -> str:
+    """That there was nothing to do, the next command where the user might miss it, and what there is to look at."""
+    workspace, words = runner.workspace, list[str]()
+    if not ran or alone is not None:
+        statuses = status.all_statuses(workspace, runner, deep=False)
+        step = status.next_step(statuses, runner.run_file.stages, workspace.root)
+        last = [name for name in stages if not stage_list.STAGES[name].summary][-1:]
+        what = "everything" if step is None else alone or f"all up to {last[0]}"
+        words = [*([] if ran else [f"nothing to do: {what} is up to date"]), *([step] if step else [])]
     found = _outputs(workspace)
     named = [str(found[name]) for name in ("report.html", "viewer.html", "mesh.glb", "video.mp4") if name in found]
-    words = "" if ran else "nothing to do: everything is up to date "
-    return words + ("→ " + "  ".join(named) if named else f"→ {workspace.root}")
+    return f"{'; '.join(words)} → {'  '.join(named) or workspace.root}".lstrip()
 
 
 def command_stage(stage: str, words: Sequence[str]) -> int:
@@ -341,8 +350,6 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
         update = {"cameras": given.cameras.absolute()}
         settings = settings.model_copy(update={"render": settings.render.model_copy(update=update)})
     stages = stage_list.needed_for(stage, dict(settings))
-    shown = [name for name in workspace.read_run().keys if stage_list.STAGES[name].summary and name not in stages]
-    stages = [*stages, *shown]
     with choose_display(given.common.json) as display:
         force = frozenset({stage}) if given.force else frozenset[str]()
         return _run_stages(given.workspace, settings, stages, given.common, display, force, alone=stage)
@@ -414,13 +421,16 @@ def _reader(root: Path) -> tuple[Workspace, Runner]:
 def command_status(words: Sequence[str]) -> int:
     """``pipeline status WORKSPACE``."""
     given = arguments.parse(arguments.StatusArguments, "status", words)
-    statuses = status.all_statuses(*_reader(given.workspace), given.verify)
+    workspace, runner = _reader(given.workspace)
+    statuses = status.all_statuses(workspace, runner, given.verify)
     code = exit_codes.DEFECT if given.verify and any(s.state == "damaged" for s in statuses) else 0
     if given.json:
         print(json.dumps([asdict(s) for s in statuses]))
         return code
     for s in statuses:
         print(f"{s.stage:<10} {s.state:<8} {s.text}".rstrip())
+    if workspace.running() is None:
+        print(status.next_step(statuses, runner.run_file.stages, workspace.root) or "everything is up to date")
     return code
 
 

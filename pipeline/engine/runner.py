@@ -278,8 +278,10 @@ class Runner:
     def _planned(self, stage: str, inputs: dict[str, str], folders: dict[str, Path], may_plan: bool) -> StageConfig:
         """The stage's config with every "choose for me" answered: from run.json, or by its plan."""
         declared, options = STAGES[stage], self.options[stage]
-        if declared.summary and (account := self.run_file.budget):
-            return declared.config.model_validate(options.model_dump() | {"budget": account.shown(STAGES)})
+        if declared.summary:
+            account = self.run_file.budget
+            known = {"budget": account and account.shown(STAGES), "resumed": self.run_file.stages}
+            return declared.config.model_validate(options.model_dump() | known)
         if declared.plan is None:
             return options
         options_for_key = self.digests.config_for_key(stage, options)

@@ -1,7 +1,8 @@
 """What is cached, stale, half done or never run, and why a stage would run; reads only, runs nothing."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from pipeline.engine import manifests
@@ -11,7 +12,7 @@ from pipeline.engine.manifests import BadManifest, Manifest
 from pipeline.engine.runner import Runner
 from pipeline.engine.stage_list import STAGES, command_that_makes
 from pipeline.engine.workspace import Workspace
-from stages.contract import KEY_LENGTH, Options, StageError
+from stages.contract import KEY_LENGTH, StageError
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def _why_unplanned(runner: Runner, stage: str, last: Manifest) -> str:
     read, options = STAGES[stage].inputs_of(runner.options[stage]), runner.options[stage]
     inputs = {name: runner.done[name].outputs_digest for name in read if name in runner.done}
     given = options.model_dump(mode="json", exclude={*STAGES[stage].not_hashed}, exclude_none=True)
-    changed = [f"{stage}.{change}" for change in _changes(options, given, last.config)]
+    changed = [f"{stage}.{change}" for change in _changes(given, last.config)]
     return "; ".join([*changed, *_other_inputs(inputs, last)]) or "its automatic options are chosen again"
 
 
@@ -93,20 +94,22 @@ def differences(job: Job, last: Manifest) -> list[str]:
     if last.version != job.stage.version:
         found.append(f"the program has changed (version {last.version} → {job.stage.version} of this stage)")
     now: dict[str, Any] = job.config.model_dump(mode="json", exclude=set(job.stage.not_hashed))
-    found += [f"{job.stage.name}.{change}" for change in _changes(job.config, now, last.config)]
+    found += [f"{job.stage.name}.{change}" for change in _changes(now, last.config)]
     found += _other_inputs(job.inputs, last)
     if not found and last.key != job.key:
         found.append("a file named in its options has changed")
     return found
 
 
-def _changes(options: Options, now: Mapping[str, Any], before: Mapping[str, Any]) -> Iterator[str]:
-    """Which ``options`` have another value ``now`` than ``before``, where both know them."""
+def _changes(now: Mapping[str, Any], before: Mapping[str, Any]) -> Iterator[str]:
+    """Which options have another value ``now`` than ``before``, where both know them."""
     for name in sorted(now.keys() & before.keys()):
-        if isinstance(nested := getattr(options, name), Options):
-            yield from (f"{name}.{change}" for change in _changes(nested, now[name], before[name]))
-        elif now[name] != before[name]:
-            yield f"{name}: {before[name]} → {now[name]}"
+        values = now[name], before[name]
+        if all(isinstance(value, dict) for value in values):
+            yield from (f"{name}.{change}" for change in _changes(*values))
+        elif values[0] != values[1]:
+            new, old = ("given" if isinstance(value, dict) else value for value in values)
+            yield f"{name}: {old} → {new}"
 
 
 def explain(workspace: Workspace, runner: Runner, stage: str) -> list[str]:
@@ -131,6 +134,19 @@ def explain(workspace: Workspace, runner: Runner, stage: str) -> list[str]:
     lines += [f"  config {name} = {value}" for name, value in sorted(job.key_config.items())]
     lines += [f"  input  {name} = {value[:KEY_LENGTH]}" for name, value in sorted(job.inputs.items())]
     return lines
+
+
+def next_step(statuses: Sequence[StageStatus], recorded: Sequence[str] | None, root: Path) -> str | None:
+    """The command that brings more of the workspace ``root`` up to date, whose last run had the ``recorded`` stages,
+    and what it does; None where all that belongs to a whole run is up to date."""
+    usual = [name for name, stage in STAGES.items() if not stage.on_request]
+    outdated = {one.stage: one.state for one in statuses if one.state != "cached"}
+    if again := [name for name in outdated if name in (recorded or usual)]:
+        verify = " --verify" if "damaged" in map(outdated.get, again) else ""
+        return f"`pipeline resume {root}{verify}` brings {', '.join(again)} up to date"
+    if later := [name for name in outdated if name in usual]:
+        return f"`{command_that_makes(later[0], recorded, root)}` continues where the last run ended"
+    return None
 
 
 def all_statuses(workspace: Workspace, runner: Runner, deep: bool) -> list[StageStatus]:

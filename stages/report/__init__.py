@@ -33,6 +33,9 @@ class Config(StageConfig):
     budget: Annotated[Account | None, Suppress] = Field(
         default=None, description="What the runner knows of the time given to the run; no flag is offered for it."
     )
+    resumed: Annotated[tuple[str, ...] | None, Suppress] = Field(
+        default=None, description="The stages of `pipeline resume`; no flag is offered for it (default: all)."
+    )
 
 
 def expected_seconds(config: Config, workload: Workload) -> float:
@@ -43,7 +46,7 @@ def expected_seconds(config: Config, workload: Workload) -> float:
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Write report.html and summary.json."""
-    from stages.report.page import page, read_results, summarise
+    from stages.report.page import command_that_scores, page, read_results, summarise
 
     progress.update("reading results")
     results = read_results(inputs, STAGE.inputs)
@@ -55,6 +58,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     (folder / "report.html").write_text(text, "utf-8", "backslashreplace")  # names of folders need not be Unicode
     doubt = "The cameras are doubtful. " if summary["cameras_doubtful"] else ""
     line = f"{doubt}{summary['verdict']}"
+    if results.metrics is None:
+        line += f" `{command_that_scores(inputs, config)}` runs it."
     return StageResult(("report.html", "summary.json"), line, facts={"verdict": line})
 
 
@@ -73,7 +78,7 @@ STAGE = Stage(
         "viewer",
         "tradeoff",
     ),
-    version=18,
+    version=19,
     exit_code=18,
     published=("report.html", "summary.json"),
     config=Config,

@@ -247,6 +247,7 @@ def _run_part(results: Results, summary: dict[str, Any], config: "Config") -> di
         "longest": max((manifest["seconds"] for manifest in manifests.values()), default=0) or 1,
         "settings": _settings(manifests),
         "machine": manifests.get("train", next(iter(manifests.values()), {})).get("machine", {}),
+        "go_on": command_that_scores(results.inputs, config),
     }
 
 
@@ -265,6 +266,12 @@ def _settings(manifests: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
 def _workspace(inputs: Inputs) -> str:
     """The workspace folder's own name: stage folders are <workspace>/<stage>/<key>."""
     return next((folder.resolve().parents[1].name for folder in inputs.values()), "")
+
+
+def command_that_scores(inputs: Inputs, config: "Config") -> str:
+    """`pipeline resume`, or where the last run ended before the score, the command of that."""
+    repeated = config.resumed is None or "evaluate" in config.resumed
+    return f"pipeline {'resume' if repeated else 'evaluate'} {shell_quoted(_workspace(inputs))}"
 
 
 def _camera_groups(results: Results, names: Mapping[str, str]) -> list[dict[str, Any]]:

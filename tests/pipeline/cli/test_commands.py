@@ -268,6 +268,38 @@ def test_a_budget_is_of_runs_alone(tmp_path: Path, capsys: pytest.CaptureFixture
     assert json.loads((tmp_path / "w.nerf/run.json").read_text())["budget"] == before
 
 
+def test_resume_and_status_name_the_same_next_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "photos").mkdir()
+    for k in range(3):
+        Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")
+    workspace = str(tmp_path / "w.nerf")
+
+    def last_line(*words: str) -> str:
+        run_command([*words, workspace])
+        return capsys.readouterr().out.splitlines()[-1]
+
+    run_on(tmp_path / "photos", capsys, "--until", "ingest")
+    step = f"`pipeline sfm {workspace}` continues where the last run ended"
+    assert last_line("status") == step
+    assert last_line("resume") == f"nothing to do: all up to ingest is up to date; {step} → {workspace}"
+    run_on(tmp_path / "photos", capsys, "--until", "sfm")  # which these photos have none of
+    step = f"`pipeline resume {workspace}` brings sfm up to date"
+    assert last_line("status") == step
+    assert last_line("ingest") == f"nothing to do: ingest is up to date; {step} → {workspace}"
+    run_on(tmp_path / "photos", capsys, "--until", "ingest", "--budget", "5m")
+    assert last_line("report").endswith("output/report.html") and last_line("status").endswith("ended")
+    run_on(tmp_path / "photos", capsys, "--until", "ingest")
+    assert "report     cached" in status_text(workspace, capsys), "a run keeps the report that there is up to date"
+    assert run_on(tmp_path / "photos", capsys, "--until", "sfm", "--budget", "5m")[0] == 11
+    assert "report     stale    report.budget: None → given" in status_text(workspace, capsys)
+
+
+def status_text(workspace: str, capsys: pytest.CaptureFixture[str]) -> str:
+    capsys.readouterr()
+    assert run_command(["status", workspace]) == 0
+    return capsys.readouterr().out
+
+
 @pytest.mark.parametrize("command", ["status", "resume", "mesh"])
 def test_options_of_another_version_are_said_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str):
     run = {"version": 2, "options": {"evaluate": {"seed": 1}}, "plans": {}, "keys": {}}

@@ -69,6 +69,7 @@ class Fixed(StageConfig):
     photos: Path = Path()
     cameras: Path | None = None
     budget: dict[str, Any] | None = None
+    resumed: tuple[str, ...] | None = None
 
 
 class Machine:

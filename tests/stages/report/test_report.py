@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stages import report
 from stages.io.files import read_json, write_json
 from stages.report import page
 from stages.tradeoff.pareto_front import recommend, table
@@ -283,6 +284,23 @@ def test_page_reads_well_when_later_stages_are_missing(
     assert (summary["psnr"] is None) == (last not in ("evaluate", "render"))
     if summary["psnr"] is None:
         assert summary["verdict"] == "Not measured: stage evaluate has not run."
+
+
+@pytest.mark.parametrize(
+    ("resumed", "command"),
+    [(None, "resume"), (("ingest", "train", "evaluate"), "resume"), (("ingest", "sfm"), "evaluate")],
+)
+def test_what_is_not_measured_names_the_command_for_it(
+    resumed: tuple[str, ...] | None, command: str, inputs: dict[str, Path], tmp_path: Path, progress: Any
+):
+    found = {stage: inputs[stage] for stage in ("ingest", "sfm", "normalise", "train")}
+    config = report.Config(resumed=resumed)
+    (tmp_path / "out").mkdir()
+    line = report.run(config, found, tmp_path / "out", progress).line
+    html = (tmp_path / "out/report.html").read_text("utf-8")
+    assert line == f"Not measured: stage evaluate has not run. `pipeline {command} fox.nerf` runs it."
+    assert f"<code>pipeline {command} fox.nerf</code> runs it." in html
+    assert f"then what follows from it: <code>pipeline {command} fox.nerf</code>" in html
 
 
 def test_without_test_photos_the_page_says_so(tmp_path: Path, progress: Any):
