@@ -123,9 +123,10 @@ def summarise(results: Results) -> dict[str, Any]:
     train = manifests["train"]["facts"] if "train" in manifests else {}
     mesh = manifests["mesh"]["facts"] if "mesh" in manifests else None
     scale = manifests["scale"]["facts"] if "scale" in manifests else {}
-    cameras = _camera_report(results)
+    cameras, photos = _camera_report(results), results.photos["photos"] if results.photos else []
+    different = sum(not photo["near_duplicate_of"] for photo in photos) or None
     return {
-        "photos": registration.get("photos", len(results.photos["photos"]) if results.photos else None),
+        "photos": registration.get("photos", different),
         **{key: registration.get(key) for key in ("registered", "near_duplicates", "camera_model", "reprojection_px")},
         "cameras_verdict": cameras.verdict,
         "cameras_doubtful": cameras.doubt is not None,

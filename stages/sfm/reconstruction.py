@@ -163,6 +163,10 @@ def _check_camera(config: "Config", photos: Sequence[Photo], progress: Progress)
         cameras = known_cameras(photos, config.camera_model, config.camera_params)
     except ValueError as error:
         raise StageError("sfm.parameter-count", what, str(error), hint) from error
+    if not any(cameras):
+        sizes = dict.fromkeys(f"{photo.width}×{photo.height}" for photo in photos)
+        why = f"their principal point is the middle of none of the photos' sizes ({listed([*sizes], MAX_NAMES)})"
+        raise StageError("sfm.parameters-of-no-photo", what, why, hint)
     if others := [f"{p.name} ({p.width}×{p.height})" for p, one in zip(photos, cameras, strict=True) if one is None]:
         raise StageError(
             "sfm.parameters-of-other-photos",

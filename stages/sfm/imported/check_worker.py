@@ -95,7 +95,7 @@ def check_imported_poses(
     shutil.rmtree((folder / DATABASE).parent, ignore_errors=True)
     ended = f"the check ended with code {ending.status}" if ending.status else None
     if ending.late:
-        ended = f"it took longer than {max_seconds:g} s"
+        ended = f"it took longer than {max_seconds:g} s (--force and a longer --sfm.max-seconds repeat it)"
     if ended and not said:
         return {"failed": ended}
     return {"adjusted_from_px": None, "triangulated": 0} | said[-1] | {"unfinished": ended}

@@ -88,8 +88,8 @@ def _write_manifest(folder: Path, stage: str) -> None:
 
 def _write_photos(folder: Path, names: list[str], size: tuple[int, int]) -> None:
     (folder / "images").mkdir()
-    photos = [{"name": name, "file": f"images/{i:04d}.png"} for i, name in enumerate(names)]
-    photos.append({"name": "blurred <b>.jpg", "file": "images/9999.png"})
+    photos = [{"name": name, "file": f"images/{i:04d}.png", "near_duplicate_of": None} for i, name in enumerate(names)]
+    photos.append({"name": "blurred <b>.jpg", "file": "images/9999.png", "near_duplicate_of": None})
     refused = [{"name": "notes & sums.jpg", "reason": "not an image: text"}]
     write_json(folder / "photos.json", {"photos": photos, "rejected": refused, "frames": {}})
     for i, _ in enumerate(names):

@@ -58,6 +58,11 @@ def test_near_duplicates_do_not_count_as_unregistered(tmp_path: Path, progress: 
     assert {count: summary[count] for count in counts} == counts
     assert "24 of 24 photos are registered, 1 near-duplicate left out;" in html
     assert "Photos without a camera: 1, of which 1 near-duplicate<" in html
+    photos = read_json(inputs["ingest"] / "photos.json")
+    photos["photos"][-1]["near_duplicate_of"] = photos["photos"][0]["name"]
+    write_json(inputs["ingest"] / "photos.json", photos)
+    _, before_sfm = written({"ingest": inputs["ingest"]}, tmp_path / "ingest-alone", progress)
+    assert before_sfm["photos"] == counts["photos"]
 
 
 def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path: Path, progress: Any):

@@ -88,8 +88,8 @@ def test_too_few_photos_are_refused_at_once(count: int, tmp_path: Path, progress
         (
             {"camera_model": "SIMPLE_PINHOLE", "camera_params": (250.0, 80.0, 60.0)},
             [(240, 180), (180, 240)],
-            "parameters-of-other-photos",
-            "3 of 3 photos",
+            "parameters-of-no-photo",
+            "the middle of none of the photos' sizes (240×180, 180×240)",
         ),
     ],
 )

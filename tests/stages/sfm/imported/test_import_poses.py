@@ -29,12 +29,13 @@ MOVED = "photo_003.jpg"
 
 
 class Import(NamedTuple):
-    """The model, the account of each photo by its stem, the codes of the notes, and the live lines."""
+    """The model, the account of each photo by its stem, and what was said: codes, live lines and notes."""
 
     model: SparseModel
     account: dict[str, dict[str, Any]]
     codes: list[str]
     updates: list[str]
+    notes: list[str]
 
     @property
     def poses(self) -> np.ndarray:
@@ -58,7 +59,8 @@ def imported(
     run_stage(sfm.STAGE, sfm.Config(cameras=cameras, **options), inputs, folder / "sfm", progress)
     account = read_json(folder / "sfm/registration.json")["images"]
     by_stem = {Path(image["file"]).stem: image for image in account}
-    return Import(read_model(folder / "sfm/sparse"), by_stem, progress.codes, [text for text, _ in progress.updates])
+    updates = [text for text, _ in progress.updates]
+    return Import(read_model(folder / "sfm/sparse"), by_stem, progress.codes, updates, progress.notes)
 
 
 def inexact(photos: SyntheticPhotos, degrees: float, share: float) -> Poses:
@@ -107,7 +109,7 @@ def test_the_same_poses_give_the_same_bytes(exact, synthetic_photos: SyntheticPh
 
 def test_official_test_photos_tell_no_points(synthetic_photos: SyntheticPhotos, tmp_path: Path) -> None:
     tests = ("photo_002.jpg", "photo_007.jpg")
-    model, account, _, _ = imported(tmp_path, synthetic_photos, tests=tests)
+    model, account, *_ = imported(tmp_path, synthetic_photos, tests=tests)
     seen = {name: image["observations"] for name, image in account.items()}
     assert [name for name, count in seen.items() if not count] == ["photo_002", "photo_007"]
     assert len(model.images) == 12 and all(image["registered"] for image in account.values())
@@ -115,7 +117,7 @@ def test_official_test_photos_tell_no_points(synthetic_photos: SyntheticPhotos, 
 
 def test_a_photo_that_contradicts_its_pose_tells_no_points(synthetic_photos: SyntheticPhotos, tmp_path: Path) -> None:
     moved = synthetic_photos.truth.poses[MOVED] + np.array([[0, 0, 0, 0.15]] * 3)
-    model, account, _, _ = imported(tmp_path, synthetic_photos, {**synthetic_photos.truth.poses, MOVED: moved})
+    model, account, *_ = imported(tmp_path, synthetic_photos, {**synthetic_photos.truth.poses, MOVED: moved})
     assert [name for name, image in account.items() if not image["observations"]] == [Path(MOVED).stem]
     off = still_life(0).distance(torch.from_numpy(model.xyz).float()).abs()
     assert off.median() < 0.005
@@ -131,7 +133,7 @@ def test_photos_with_alpha_get_no_points(synthetic_photos: SyntheticPhotos, tmp_
     poses = {Path(name).with_suffix(".png").name: pose for name, pose in synthetic_photos.truth.poses.items()}
     truth = Truth(synthetic_photos.truth.camera, poses, 0)
     cut_out = SyntheticPhotos(tmp_path / "photos", truth)
-    model, account, _, _ = imported(tmp_path / "run", cut_out)
+    model, account, *_ = imported(tmp_path / "run", cut_out)
     assert not len(model.xyz) and all(image["agreement"] for image in account.values())
 
 
@@ -187,6 +189,7 @@ def test_a_check_that_hangs_is_ended_in_time(
     monkeypatch.setattr(check_worker, "COMMAND", ["-c", f"{hanging}; c.main()"])
     found = imported(tmp_path, synthetic_photos, max_seconds=3.0)
     assert found.codes == ["sfm.poses-unchecked"]
+    assert "--force and a longer --sfm.max-seconds" in found.notes[0], "a longer one alone leaves the result cached"
     assert all(image["agreement"] is None for image in found.account.values())
     assert sorted(path.name for path in (tmp_path / "sfm").iterdir()) == ["registration.json", "sfm.log", "sparse"]
 
