@@ -195,9 +195,9 @@ STAGE = Stage(
     resumes=True,
     published=("sparse", "registration.json"),
     config=Config,
-    # Both may make the stage skip a retry strategy, the first one the check of imported poses; it then says so. They stay
-    # out of the key, so that a run with another limit finds the matches of the one before it and resumes from them.
-    # ``seconds`` also sets the quality of feature extraction, which enters the key by options of its own
+    # Both may make the stage skip a retry strategy, the first one the check of imported poses; it then says so. They
+    # stay out of the key, so that a run with another limit finds the matches of the one before it and resumes from
+    # them. ``seconds`` also sets the quality of feature extraction, which enters the key by options of its own
     # (max_image_size, max_features).
     not_hashed=("max_seconds", "seconds"),
     plan=plan,
