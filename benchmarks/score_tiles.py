@@ -12,14 +12,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from kornia.metrics import ssim
-from PIL import Image
 
 from benchmarks.record import Record, add_out
+from benchmarks.renders import read_render_and_photo
 from nerf.training.metrics import psnr
 from stages.evaluate import tiles
 from stages.evaluate.image_metrics import SSIM_WINDOW
 from stages.io.files import read_json, read_scene
-from stages.train.data import PhotoReader
 
 SIZES, FRACTIONS, CHOICES = (16, 24, 32, 64), (0.02, 0.05, 0.1, 0.25), 40
 
@@ -38,12 +37,8 @@ def maps(workspace: Path) -> list[Maps]:
     scene, metrics = read_scene(output), read_json(output / "metrics.json")
     views = {view.name: view for view in scene.views}
     for image in metrics["images"]:
-        with Image.open(output / image["render"]) as picture:
-            render = torch.from_numpy(np.asarray(picture.convert("RGB")) / np.float32(255))
-        view = views[image["name"]]
-        downscale = scene.cameras[view.camera].width / render.shape[1]
-        photo = PhotoReader(output, scene, downscale).pixels(view, metrics["background"])
-        one, other = (pixels.permute(2, 0, 1)[None] for pixels in (render, photo))
+        given = output, scene, views[image["name"]], metrics["background"]
+        one, other = read_render_and_photo(output / image["render"], *given)
         similarity = ssim(one, other, SSIM_WINDOW, eps=0.0, padding="valid")[0].mean(0)
         found.append(Maps((one - other)[0].square().mean(0), similarity))
     return found

@@ -6,14 +6,12 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
+from benchmarks.renders import read_render_and_photo
 from nerf.geometry.scene import Scene
 from stages.io.files import read_json
-from stages.train.data import PhotoReader
 
 VGG = "vgg16-397923af.pth"  # torchvision's file in torch's cache
 Distance = Callable[[Tensor, Tensor], Tensor]
@@ -37,10 +35,6 @@ def mean_lpips(evaluate: Path, ingest: Path, scene: Scene, distance: Distance | 
     with torch.no_grad():
         for view in scene.of_split("test"):
             file = evaluate / "renders" / Path(view.file.removeprefix("images/")).with_suffix(".png")
-            with Image.open(file) as picture:
-                render = torch.from_numpy(np.asarray(picture.convert("RGB")) / np.float32(255))
-            downscale = scene.cameras[view.camera].width / render.shape[1]
-            photo = PhotoReader(ingest, scene, downscale).pixels(view, background)
-            one, other = (2 * pixels.permute(2, 0, 1)[None] - 1 for pixels in (render, photo))
-            found.append(float(distance(one, other)))
+            render, photo = read_render_and_photo(file, ingest, scene, view, background)
+            found.append(float(distance(2 * render - 1, 2 * photo - 1)))
     return round(sum(found) / len(found), 3)
