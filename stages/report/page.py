@@ -14,7 +14,7 @@ from PIL import Image
 from nerf.geometry.scene import Scene
 from stages.contract import Inputs
 from stages.evaluate.summary import scored_on
-from stages.io.amounts import duration, short_count
+from stages.io.amounts import counted, duration, short_count
 from stages.io.ascii_names import shell_quoted
 from stages.io.files import SMALL_COPY, read_json, read_scene, read_tensors
 from stages.io.pixels import load_view, pillow
@@ -158,6 +158,7 @@ def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
     """The whole HTML page."""
     environment = templates(Path(__file__).parent)
     environment.filters |= {
+        "counted": counted,
         "duration": duration,
         "short": short_count,
         "thousands": "{:,}".format,

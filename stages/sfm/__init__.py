@@ -16,6 +16,7 @@ from stages.contract import (
     StageResult,
     Workload,
 )
+from stages.io.amounts import counted
 from stages.io.files import write_json
 from stages.sfm.pairs import MAX_EXHAUSTIVE, Matcher
 
@@ -181,7 +182,7 @@ def _line(registration: dict[str, Any]) -> str:
     error, points = registration["reprojection_px"], registration["points"]
     line = f"{registration['registered']}/{registration['photos']} {what}"
     if same := registration["near_duplicates"]:
-        line += f", {same} near-duplicate{'s' * (same != 1)} left out"
+        line += f", {counted(same, 'near-duplicate')} left out"
     line += "" if error is None else f", {error:.2f} px"
     line += f" · {registration['camera_model']}"
     return line + (f" · {points:,} points".replace(",", " ") if points else "")

@@ -142,14 +142,13 @@ def _try_strategies(state: JobState) -> None:
         elif why := _why_useless(strategy, missing, state):
             log.skipped[strategy.name] = Skip(why)
             unsaid.setdefault(why, []).append(strategy.description)
-        elif why := _why_infeasible(strategy, missing, state):
+        elif why := _why_infeasible(strategy, takes := _expected(strategy, missing, state), state):
             log.skipped[strategy.name] = why
         else:
             are = "is" if len(missing) == 1 else "are"
             why = f"{len(missing)} of {len(state.photos)} photos {are} unregistered"
             if _is_misfit(state):
                 why = "the cameras do not fit the verified matches"
-            takes = _expected(strategy, missing, state)
             duration = f" (about {rough_duration(takes)})" if takes >= MIN_SECONDS_SAID else ""
             state.send(note=Note("sfm.strategy", f"{why}: {strategy.description}{duration}"))
             _try(strategy, missing, state)
@@ -182,14 +181,15 @@ def _is_misfit(state: JobState) -> bool:
     return best is not None and not best.fits
 
 
-def _why_infeasible(strategy: Strategy, missing: list[int], state: JobState) -> Skip | None:
-    """Why the strategy might help and is skipped all the same, which is said; None if it is tried."""
+def _why_infeasible(strategy: Strategy, expected: float, state: JobState) -> Skip | None:
+    """Why the strategy, of so many ``expected`` seconds, might help and is skipped all the same, which is said; None if
+    it is tried."""
     if ended := state.log.abandoned.get(strategy.name):
         state.send(
             note=Note("sfm.strategy-failed-before", f"not tried, because {ended.why} last time: {strategy.description}")
         )
         return ended
-    outcomes, (left, limit), expected = state.log.outcomes, state.left(), _expected(strategy, missing, state)
+    outcomes, (left, limit) = state.log.outcomes, state.left()
     if not exceeds_time(expected, outcomes, left):
         return None
     rest = f"{rough_duration(max(0.0, left))} of {limit} are left"

@@ -211,5 +211,5 @@ def test_the_time_given_is_exceeded_before_all_is_lost(limit: str, found: bool, 
         usable=lambda: outcome if found else None,
         send=lambda note: said.append(note.code),
     )
-    skipped = worker._why_infeasible(STRATEGIES[5], [0, 1, 2, 3], state)
+    skipped = worker._why_infeasible(STRATEGIES[5], worker._expected(STRATEGIES[5], [0, 1, 2, 3], state), state)
     assert said == [code] and (skipped is None) == (code == "sfm.takes-longer")
