@@ -10,7 +10,7 @@ otherwise be the answer for every scene. It is placed beside them.
 many as give ``MIN_DEGREES_OF_FREEDOM`` degrees of freedom, but, where nearer ones tell something, none that took more
 than ``MAX_TIME_RATIO`` times as long or as short. That of two seeds alone is hardly known: with n degrees of freedom a
 standard deviation is uncertain by 1 / √(2n) of itself. But only similar settings may be pooled: after a hundred steps
-seeds differ by 2 dB, after a thousand by 0.05 (fox, docs/results.md).
+seeds differ by 2 dB, after a thousand by 0.05 (fox).
 """
 
 import math

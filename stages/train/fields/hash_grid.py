@@ -63,7 +63,7 @@ EVEN_UNTIL = 0.25  # contracted space: scene units from the camera up to which s
 # for more.
 MAX_SAMPLES = 1024
 SAMPLES_PER_RAY = {"bounded": 3, "contracted": 10, "ndc": 6}
-"""Colours computed for a ray, over a run: measured on lego_400 and five photo sets (docs/results.md)."""
+"""Colours computed for a ray, over a run: measured on lego_400 and five photo sets."""
 SIZES = {
     "bounded": ((50e6, 5, 18, 512), (0, 4, 17, 256)),
     "contracted": ((30e6, 6, 18, 1024), (0, 5, 17, 512)),

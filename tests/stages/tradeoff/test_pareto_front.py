@@ -142,7 +142,7 @@ def test_the_command_names_a_workspace_whose_name_is_not_unicode() -> None:
     words.encode()
 
 
-# Settings of the study of fox in docs/results.md: seconds, dB, deviation over two seeds.
+# Settings of the study of fox: seconds, dB, deviation over two seeds.
 FOX_GRID = [(2.1, 14.09, 0.86), (3.8, 15.99, 1.69), (6.6, 18.61, 1.73), (10.8, 21.67, 0.51), (18.3, 24.83, 0.22)]
 FOX_GRID += [(30.4, 27.72, 0.03), (48.9, 29.26, 0.05)]
 FOX_VANILLA = [(26.8, 18.79, 0.84), (27.3, 18.91, 0.88)]

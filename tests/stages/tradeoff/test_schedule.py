@@ -36,7 +36,7 @@ from stages.train.fields import hash_grid, vanilla
 FAST = {name: Speed(100.0, 1e6) for name in TIMED}
 SIZES = (1.0, 2.0, 4.0, 8.0)
 SPACES = pytest.mark.parametrize("space", ["bounded", "contracted"])
-# Two cores without a GPU: steps and rays a second, as in the studies of docs/results.md; the published networks' steps
+# Two cores without a GPU: steps and rays a second, as in the studies; the published networks' steps
 # by their arithmetic.
 CORES = {"small grid": Speed(32.0, 200e3), "grid": Speed(27.0, 170e3), "large grid": Speed(21.0, 130e3)}
 CORES |= {REDUCED: Speed(27.0, 6.9e3), PUBLISHED: Speed(0.066, 68.0), FEWER_RAYS: Speed(1.06, 68.0)}
