@@ -7,7 +7,7 @@ runs ``pipeline run`` with so many steps on each. A set that FOLDER holds alread
 resume a run is to call this again. A row: registered photos, the largest distance of a camera from the truth in percent
 of the street's length, seconds of each stage, and the largest resident memory of all processes together.
 
-Prints the exponents last: seconds ∝ photos^exponent between the two largest sets.
+The last row has the exponents: seconds ∝ photos^exponent between the two largest sets.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from stages.io.files import read_json
 from stages.io.photos import read_photos
 from stages.sfm.colmap.models import read_model
 
-STAGES = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh")
+STAGES = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "viewer", "report")
 SAMPLE_SECONDS = 0.5
 
 
@@ -78,12 +78,13 @@ def figures(workspace: Path, truth: dict[str, np.ndarray], peak_gb: float) -> di
     }
 
 
-def exponents(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """Of photos, between the last two rows, for every figure that is measured in seconds or bytes."""
+def exponents(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Of photos, between the last two rows, for every figure that is measured in seconds or bytes; a row as well."""
     below, above = rows[-2:]
     steps = math.log(above["photos"] / below["photos"])
     grows = [key for key in above if key.endswith(("_seconds", "_gb")) and below.get(key)]
-    return {key: round(math.log(above[key] / below[key]) / steps, 2) for key in grows}
+    powers = {key: round(math.log(above[key] / below[key]) / steps, 2) for key in grows}
+    return {"photos": f"exponent, {below['photos']} to {above['photos']}"} | powers
 
 
 def plot(rows: list[dict[str, Any]], file: Path) -> None:
@@ -117,7 +118,7 @@ def main() -> None:
         rows.append(figures(workspace, truth, run(folder / "photos", workspace, given.steps)))
         record.add(**rows[-1])
     if len(rows) > 1:
-        print("exponents:", exponents(rows))
+        record.add(**exponents(rows))
     if given.plot:
         plot(rows, given.plot)
 
