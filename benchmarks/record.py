@@ -25,7 +25,7 @@ COLUMNS = {  # key: heading, format
     "frame_seconds": ("frame (s)", ",.2f"),
     "rays_per_second": ("rays/s", ",.0f"),
     "colours_per_second": ("samples/s", ",.0f"),
-    "reprojection_px": ("px", ".2f"),
+    "reprojection_px": ("reprojection (px)", ".2f"),
     "width_share": ("width", ".0%"),
 }
 UNITS = {  # last word of a key: unit, format

@@ -31,9 +31,9 @@ def page() -> str:
     records = {path.stem: json.loads(path.read_text("utf-8")) for path in sorted(RESULTS.glob("*.json"))}
 
     def made(name: str) -> str:
-        """Where the figures of a file come from."""
+        """Where the figures of a file come from, in brackets, as a sentence ends with it."""
         record = records[name]
-        return f"`{record['command']}` · {record['date']} · {record['machine']} · {record['commit']}"
+        return f"(`{record['command']}` · {record['date']} · {record['machine']} · {record['commit']})"
 
     rows = {name: [written(row) for row in record["figures"]] for name, record in records.items()}
     published = records.get("published", {"figures": []})["figures"]
