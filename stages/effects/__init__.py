@@ -37,11 +37,12 @@ class Config(StageConfig):
         default=PILOT_STEPS,
         ge=0,
         description=(
-            "Steps of each A/B training run (pilot), which decides where the statistics are unclear; 0: no pilots."
+            "Steps of each training of an A/B run: short trainings with an effect and without, which decide where the "
+            "statistics are unclear; 0: no A/B runs."
         ),
     )
     pilots: Auto[int] = Field(
-        default=None, ge=0, description="Maximum number of pilots (default: 2, fewer if there is too little time)."
+        default=None, ge=0, description="Maximum number of A/B runs (default: 2, fewer if there is too little time)."
     )
     fitting_pilots: Annotated[int | None, Suppress] = Field(
         default=None, ge=0, description="of these, how many may fit poses; none: all"
@@ -49,9 +50,9 @@ class Config(StageConfig):
     seconds: Auto[float] = Field(
         default=None,
         ge=0,
-        description="Time limit of all pilots (default: from the budget; none for a run of --train.steps).",
+        description="Time limit of all A/B runs (default: from the budget; none for a run of --train.steps).",
     )
-    seed: int = Field(default=0, description="Seed of the pilots.")
+    seed: int = Field(default=0, description="Seed of the A/B runs.")
 
     @field_validator("force")
     @classmethod
@@ -91,14 +92,14 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
         return config.model_copy(update={"pilots": 0})
     from stages.effects.ab_runs import expected_seconds
 
-    progress.update("timing a pilot")
+    progress.update("timing an A/B run")
     took, fitting = expected_seconds(read_scene(inputs["normalise"]), config.pilot_steps)
     pilots = min(MAX_PILOTS, int(config.seconds / took))
     more = (config.seconds - pilots * took) / (fitting - took)
     if pilots < MAX_PILOTS:
         progress.note(
             "effects.few-pilots",
-            f"time allows {pilots} of up to {MAX_PILOTS} pilots (A/B training runs): one takes up to {duration(took)} "
+            f"time allows {pilots} of up to {MAX_PILOTS} A/B runs: one takes up to {duration(took)} "
             f"here, and {duration(config.seconds)} are available",
         )
     return config.model_copy(update={"pilots": pilots, "fitting_pilots": min(pilots, int(more))})

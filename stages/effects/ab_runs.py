@@ -175,7 +175,7 @@ def run_pilot(
         scores: dict[str, list[float]] = {}
         for name in ("off", "on") if number % 2 else ("on", "off"):
             done = (2 * number + len(scores)) / (2 * SEEDS)
-            progress.update(f"pilot training {2 * number + len(scores) + 1} of {2 * SEEDS}", done)
+            progress.update(f"A/B training {2 * number + len(scores) + 1} of {2 * SEEDS}", done)
             started = time.perf_counter()
             trained = _trained(trial, decisions[name], steps, seed + number)
             seconds[name] += time.perf_counter() - started

@@ -155,7 +155,7 @@ class _Study:
         if math.isinf(statistic.noise):
             return Verdict(default, statistic.words)
         if why := self._why_no_pilot(off, on):
-            return Verdict(default, f"{statistic.words}; unclear, and no pilot: {why}")
+            return Verdict(default, f"{statistic.words}; unclear, and no A/B run: {why}")
         return self._piloted(effect, off, on)
 
     def _why_no_pilot(self, off: Decisions, on: Decisions) -> str | None:
@@ -178,9 +178,9 @@ class _Study:
             steps, seed = self.config.pilot_steps, self.config.seed
             pilot = ab_runs.run_pilot(self.trial, off, on, steps, seed, self.progress, default)
         except NonFinite as fault:
-            return Verdict(default, f"{words}; unclear, and the pilot diverged: {fault}")
+            return Verdict(default, f"{words}; unclear, and the A/B run diverged: {fault}")
         seeds = "" if pilot.seeds == ab_runs.SEEDS else f" with {pilot.seeds} of {ab_runs.SEEDS} seeds"
-        gain = f"a pilot gained {pilot.gain_db:+.2f} ± {pilot.noise_db:.2f} dB{seeds}"
+        gain = f"an A/B run gained {pilot.gain_db:+.2f} ± {pilot.noise_db:.2f} dB{seeds}"
         stays = not pilot.hurts if default else pilot.pays
         return Verdict(stays, f"{words}; {gain}", pilot)
 

@@ -100,7 +100,7 @@ def test_a_pilot_decides_by_gain_against_noise(decided: Callable, gain: float, o
     decisions, table, _, tried = decided(effects.Config(), gain, exposure=found(None))
     assert tried == ["exposure"] and ("exposure" in decisions.on) is on
     assert (table["exposure"]["pilot_gain_db"], table["exposure"]["seconds"]) == (gain, 3.25)
-    assert table["exposure"]["reason"] == f"one of two; a pilot gained {gain:+.2f} ± 0.20 dB"
+    assert table["exposure"]["reason"] == f"one of two; an A/B run gained {gain:+.2f} ± 0.20 dB"
 
 
 @pytest.mark.parametrize("called_for", [None, False])
@@ -128,7 +128,7 @@ def test_there_are_two_pilots_at_most(decided: Callable) -> None:
     grey = {name: found(None) for name in ("exposure", "view_dependence", "pose_refinement")}
     decisions, table, _, tried = decided(effects.Config(), 1.0, **grey)
     assert tried == ["exposure", "pose_refinement"] and "view_dependence" in decisions.on
-    assert table["view_dependence"]["reason"] == "one of two; unclear, and no pilot: 2 already made"
+    assert table["view_dependence"]["reason"] == "one of two; unclear, and no A/B run: 2 already made"
 
 
 def test_a_diverging_pilot_leaves_the_effect(decided: Callable) -> None:
@@ -137,14 +137,14 @@ def test_a_diverging_pilot_leaves_the_effect(decided: Callable) -> None:
 
     decisions, table, *_ = decided(effects.Config(), 1.0, diverging, exposure=found(None))
     assert "exposure" not in decisions.on
-    assert table["exposure"]["reason"].endswith("unclear, and the pilot diverged: the loss of step 3 is not finite")
+    assert table["exposure"]["reason"].endswith("unclear, and the A/B run diverged: the loss of step 3 is not finite")
 
 
 def test_without_pilots_the_grey_zone_follows_publication(decided: Callable) -> None:
     grey = {name: found(None) for name in ("exposure", "view_dependence", "pose_refinement")}
     decisions, table, _, tried = decided(effects.Config(pilot_steps=0), 1.0, **grey)
     assert not tried and decisions == Decisions({"view_dependence": {}, "background": {}})
-    assert table["exposure"]["reason"] == "one of two; unclear, and no pilot: --effects.pilot-steps 0"
+    assert table["exposure"]["reason"] == "one of two; unclear, and no A/B run: --effects.pilot-steps 0"
 
 
 def test_what_nothing_is_known_of_is_not_tried(decided: Callable) -> None:
@@ -221,7 +221,7 @@ def test_pilots_are_made_as_far_as_they_fit(
     grey = {name: found(None) for name in ("exposure", "pose_refinement")}
     _, table, _, tried = decided(effects.Config(seconds=seconds), 1.0, **grey)
     assert len(tried) == pilots_made
-    assert (table["pose_refinement"]["reason"] == "one of two; unclear, and no pilot: there is no time for one") == (
+    assert (table["pose_refinement"]["reason"] == "one of two; unclear, and no A/B run: there is no time for one") == (
         pilots_made == 0
     )
 
@@ -242,5 +242,5 @@ def test_a_pose_fitting_pilot_must_fit_the_time(
     grey = {name: found(None) for name in ("pose_refinement", "view_dependence")}
     _, table, _, tried = decided(effects.Config(seconds=seconds), -1.0, **grey)
     assert tried == made
-    why = "one of two; unclear, and no pilot: there is no time for one that fits poses"
+    why = "one of two; unclear, and no A/B run: there is no time for one that fits poses"
     assert (table["pose_refinement"]["reason"] == why) == ("pose_refinement" not in made)

@@ -88,7 +88,7 @@ def test_page_shows_what_the_photos_call_for(tmp_path: Path, progress: Any):
         "statistic",
         "threshold",
         "noise",
-        "gain in pilot",
+        "gain in A/B run",
         "costs when on",
         "deciding took",
     ]
