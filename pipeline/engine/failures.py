@@ -8,6 +8,15 @@ from pathlib import Path
 from stages.contract import StageError
 from stages.io.files import read_json, write_durably
 
+LESS_MEMORY = {  # what else may be tried, by stage
+    "sfm": ", or give a smaller --sfm.max-image-size or --sfm.max-features",
+    "depth": ", or give a larger --depth.downscale",
+    "train": ", or give a larger --train.downscale",
+    "evaluate": ", or give a larger --evaluate.downscale",
+    "render": ", or give a smaller --render.width",
+    "mesh": ", or give a smaller --mesh.resolution",
+    "tradeoff": ", or give a larger --tradeoff.downscale",
+}
 FAILURE = "failure.json"  # in a partial folder: what ended the last attempt at the stage, or at its plan
 
 
@@ -31,7 +40,7 @@ def worded(stage: str) -> Iterator[None]:
     except (MemoryError, RuntimeError) as error:
         if not _is_out_of_memory(error):
             raise
-        hint = "Close other programs, or lower the resolution or batch settings of this stage."
+        hint = f"Close other programs{LESS_MEMORY.get(stage, '')}."
         why = str(error).splitlines()[0] if str(error) else f"{stage} needs more memory than there is"
         raise StageFailed(stage, StageError("pipeline.out-of-memory", "out of memory", why, hint)) from error
 

@@ -97,7 +97,7 @@ def differences(job: Job, last: Manifest) -> list[str]:
     found += [f"{job.stage.name}.{change}" for change in _changes(now, last.config)]
     found += _other_inputs(job.inputs, last)
     if not found and last.key != job.key:
-        found.append("a file named in its options has changed")
+        found.append("the photos or a file in its options have changed")
     return found
 
 
