@@ -247,7 +247,7 @@ def _keeping_studies(settings: Settings, root: Path, words: Sequence[str], file:
 def _budget(text: str | None, settings: Settings) -> float | None:
     """The seconds of ``--budget``. Raises UsageError beside steps, which take as long as they take, and ``--more``."""
     if text is not None and settings.train.after is not None:
-        raise UsageError("--budget and --more are two budgets; give one")
+        raise UsageError("--budget and --more both limit the time; give one")
     if text is not None and settings.train.steps is not None:
         what = f"--budget {text} and --train.steps {settings.train.steps}: a number of steps cannot keep a budget"
         raise UsageError(f"{what}; leave out one, or give --train.seconds")

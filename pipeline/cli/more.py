@@ -26,7 +26,7 @@ def with_more(settings: Settings, workspace: Workspace, text: str) -> Settings:
     recorded = workspace.read_run()
     for name, value in budgets.items():
         if value is not None and value != recorded.options["train"][name]:
-            raise UsageError(f"--more and --train.{name} are two budgets; give one")
+            raise UsageError(f"--more and --train.{name} both set the training time; give one")
     key = recorded.keys.get("train")
     command = command_that_makes("train", recorded.stages, workspace.root)
     finished = None if key is None else _finished(workspace, key, command)

@@ -148,6 +148,7 @@ def read_training_photos(inputs: Inputs, downscale: float) -> TrainingPhotos:
     for index in scene.indices_of("train"):
         if not np.isfinite(scene.views[index].scene_from_camera).all():
             what = f"the pose of {scene.views[index].name} is not finite"
-            raise StageError("depth.pose-not-finite", what, "scene.json holds NaN or infinity", "Run normalise again.")
+            hint = "Make it again: pipeline normalise WORKSPACE --force"
+            raise StageError("depth.pose-not-finite", what, "scene.json holds NaN or infinity", hint)
     points = read_tensors(inputs["normalise"] / "points.safetensors")
     return TrainingPhotos(inputs["ingest"], scene, points, downscale)

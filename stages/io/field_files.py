@@ -19,6 +19,8 @@ from stages.effects.image_effects import check_learnt_colours, new_view_effects
 from stages.hardware.backend import BackendName, backend_name, backend_of_field, load_backend
 from stages.io.files import first_fault, read_json, write_json
 
+TRAIN_AGAIN = "Train again: pipeline train WORKSPACE --force"
+
 
 def save_field(folder: Path, model: RadianceModel, info: dict[str, Any]) -> None:
     """Write a field; ``info`` says what it was trained on (background, downscale, steps, rays) and what its ``effects``
@@ -58,7 +60,7 @@ def load_field(
         check_learnt_colours(info)
     except ValidationError as error:
         raise StageError(
-            "io.field-settings", "cannot read the trained field", first_fault(error), "Run stage train again."
+            "io.field-settings", "cannot read the trained field", first_fault(error), TRAIN_AGAIN
         ) from error
     except (
         OSError,
@@ -71,7 +73,7 @@ def load_field(
         SafetensorError,
     ) as error:
         why = " ".join(str(error).split())  # torch lists mismatches over several lines
-        raise StageError("io.field-weights", "cannot read the trained field", why, "Run stage train again.") from error
+        raise StageError("io.field-weights", "cannot read the trained field", why, TRAIN_AGAIN) from error
     model = model.to(device).requires_grad_(False)
     effects = new_view_effects(info, device=device)
     return AppearanceModel(model, effects) if effects else model, info

@@ -65,7 +65,7 @@ def stand_in(data: bytes) -> str | None:
 
 def damaged(code: str, name: str, why: str) -> StageError:
     """The error for a file that one of our stages wrote and that is not any more as it was."""
-    return StageError(code, f"cannot read {name}", why, "Delete its folder and run again.")
+    return StageError(code, f"cannot read {name}", why, "`pipeline resume WORKSPACE --verify` rebuilds it.")
 
 
 def read_dataclass(path: Path, kind: type[T]) -> T:

@@ -49,7 +49,9 @@ class Config(StageConfig):
         default=None, gt=0, description="Density at the surface (default: where the photos' rays terminate)."
     )
     keep: Keep = Field(default="visible", description="Components of the surface to keep.")
-    min_views: int = Field(default=2, ge=1, description="Photos that must see a component for it to count as visible.")
+    min_views: int = Field(
+        default=2, ge=1, description="Photos that must see a face for it to be kept; the same holds for components."
+    )
     min_component: float = Field(
         default=0.01, ge=0, le=1, description="Area of the smallest component kept, as a fraction of the largest one's."
     )

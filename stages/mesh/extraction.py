@@ -213,7 +213,7 @@ def _refined(
 
     refined = refine(surface, sightings, voxel_size.at(surface.vertices), report)
     if refined is None:
-        progress.note("mesh.not-refined", "two photos see hardly anything of the surface: it is not refined")
+        progress.note("mesh.not-refined", "hardly any of the surface is visible in two photos: it is not refined")
         return surface, None, sightings
     if not refined.kept:
         progress.note("mesh.no-better-refined", "the photos agree no better on the refined surface: it stays as it was")

@@ -96,9 +96,9 @@ def _check(config: "Config", views: int) -> None:
     if config.roi and config.roi[3] <= 0:
         raise StageError(
             "normalise.roi-radius",
-            f"--normalise.roi has radius {config.roi[3]:g}",
-            "the fourth number, half the side of the region, must be above 0",
-            "Give x y z radius in the frame of output/transforms.json.",
+            f"--normalise.roi has half-side {config.roi[3]:g}",
+            "the half-side of the region, the fourth number, must be above 0",
+            "Give x y z half-side in the frame of output/transforms.json.",
         )
 
 

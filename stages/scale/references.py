@@ -72,7 +72,7 @@ def without_contradictions(references: Sequence[Reference], progress: Progress) 
     else:
         progress.note(
             "scale.no-agreement",
-            f"no lengths are used, for they contradict each other ({told}): measure them again, or give one of them",
+            f"no lengths are used, because they contradict each other ({told}): measure them again, or give only one",
         )
     return [replace(one, problem="disagrees") if one.usable and one not in group else one for one in references]
 

@@ -85,8 +85,8 @@ class Config(StageConfig):
     camera_params: Auto[tuple[float, ...]] = Field(
         default=None,
         description=(
-            "Known parameters of --sfm.camera-model in COLMAP's order, for photos of one size; they turn and scale "
-            "with the others and are not refined (default: estimated)."
+            "Known parameters of --sfm.camera-model in COLMAP's order, which are not refined; they are those of one "
+            "photo size, and are turned and rescaled for photos of other sizes (default: estimated)."
         ),
     )
     matcher: Auto[Matcher] = Field(

@@ -194,7 +194,7 @@ def _why_infeasible(strategy: Strategy, expected: float, state: JobState) -> Ski
         return None
     rest = f"{rough_duration(max(0.0, left))} of {limit} are left"
     if limit == TIME_GIVEN and state.usable() is None and not exceeds_time(expected, outcomes, state.left_at_most()):
-        why = f"without cameras nothing goes on, so more time than given is taken: {rest}"
+        why = f"the other stages need cameras, so this takes longer than the given time: {rest}"
         state.send(note=Note("sfm.takes-longer", why))
         return None
     times = f"about {rough_duration(expected)} and the final bundle adjustment, and only {rest}"

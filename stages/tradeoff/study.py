@@ -210,7 +210,8 @@ def run_study(config: "Config", inputs: Inputs, folder: Path, progress: Progress
         failed = [f"{run.label} ({figures['failed']})" for run, figures in results if figures["failed"]]
         if len(failed) == len(results):
             why = "; ".join(dict.fromkeys(str(figures["failed"]) for _, figures in results))
-            raise StageError("tradeoff.no-result", "the study has no result", why, "Correct what stopped the runs.")
+            hint = "Correct the cameras or the masks, then give the same command again."
+            raise StageError("tradeoff.no-result", "the study has no result", why, hint)
         last = _RunProgress(progress, WORKSPACE_FIELD, spent() / config.seconds)
         existing = score_workspace_field(benchmark, inputs, runs, config.seconds, last)
     return Outcome(results, (*list_runs((*schedule.left_out, *late)), *failed), existing, benchmark)

@@ -26,7 +26,7 @@ PRESET_FIELDS: dict[str, FieldName] = {"paper": "vanilla"}  # the field that a p
 
 
 class Config(StageConfig):
-    """How the field is trained. Options that are left open follow from the scene and the budget.
+    """How the field is trained. Options that are left open follow from the scene and the training time.
 
     An option of a field selects that field. Only the options of the selected field are recorded.
     """
@@ -70,7 +70,7 @@ class Config(StageConfig):
         default=False, description="Supervise the hash-grid field by the depth maps of stage depth, which runs first."
     )
     downscale: Auto[float] = Field(
-        default=None, ge=1, description="Photo width divided by trained width (default: as the budget allows)."
+        default=None, ge=1, description="Photo width divided by trained width (default: as the training time allows)."
     )
     background: Auto[Literal["white", "black", "random"]] = Field(
         default=None, description="Background behind transparent pixels (default: random for grid, white for vanilla)."
@@ -127,7 +127,7 @@ class Config(StageConfig):
     def _one_budget(self) -> "Config":
         if self.steps is not None and self.seconds is not None:
             given = f"--train.steps {self.steps} and --train.seconds {self.seconds:g}"
-            raise ValueError(f"{given} are two budgets; give one")
+            raise ValueError(f"{given} both set the training time; give one")
         return self
 
     @model_validator(mode="after")

@@ -61,7 +61,7 @@ def doubling_message(points: Sequence[dict[str, Any]], gain: PredictedGain | Non
     message = f"the last doubling of training time, to {duration(curve[-1][0])}, gained {last:+z.1f} dB on test pixels"
     if gain is None:
         return message
-    message += " (less over a run of half the time, which would have ended above this curve)"
+    message += " (a separate run of half the time would end higher, so the gain over it is smaller)"
     again = f"twice the training time at these sizes ({more_option(points)})"
     return f"{message}; {again} is predicted to gain {gain.db:+z.1f} dB (± {gain.half_width:.1f})"
 

@@ -501,7 +501,7 @@ def lost_time_message(seconds: float) -> str | None:
 
 def target_already_reached_message(target_psnr: float) -> str:
     """That a target which the finished run has reached does not end its continuation."""
-    return f"{target_psnr:g} dB are already reached: training uses the whole additional budget"
+    return f"{target_psnr:g} dB are already reached: training goes on to the end of the additional time"
 
 
 def target_revision_message(state: RunState, target_psnr: float, schedule: StepSchedule) -> str:

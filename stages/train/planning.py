@@ -152,7 +152,7 @@ def chosen_downscale(
     if least > wanted and progress:
         progress.note(
             "train.memory-limits-photos",
-            f"photos at 1/{least:g} of their size: at 1/{wanted:g}, which the budget allows, their pixels take "
+            f"photos at 1/{least:g} of their size: at 1/{wanted:g}, which the training time allows, their pixels take "
             f"{bytes_in_words(table / wanted**2)}, and only {bytes_in_words(free)} of GPU memory are free",
         )
     return max(wanted, least)

@@ -77,7 +77,7 @@ def load(config: "Config", inputs: Inputs, progress: Progress) -> Contents:
             "viewer.features",
             "cannot pack the field",
             f"its levels have {renderer.field.settings.features_per_level} features each, not {FEATURES}",
-            "Train it again with this version.",
+            "Train it again with this version: pipeline train WORKSPACE --force",
         )
     table, comparison = _table(config, inputs, renderer, field, scene, progress)
     parts = sections(renderer.field, table) | {"palette": palette()} | sparse_points(inputs)

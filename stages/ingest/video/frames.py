@@ -82,8 +82,8 @@ def take_frames(video: Path, most: int, folder: Path, progress: Progress) -> lis
     way = frames[-1].path
     progress.note(
         "ingest.frames-taken",
-        f"took {len(chosen)} of {len(frames)} frames: the sharpest after each image motion of about "
-        f"{way / (len(chosen) - 1):.0%} of the image width; the whole motion is {way:.1f} widths",
+        f"took {len(chosen)} of {len(frames)} frames: the sharpest in each step of about "
+        f"{way / (len(chosen) - 1):.0%} of the image width; the image moves {way:.1f} widths in all",
     )
     return list(_write(video, frames, chosen, filters, folder, progress))
 

@@ -142,7 +142,7 @@ def _unreadable(photo: Photo, error: OSError) -> StageError:
         "mesh.photo-unreadable",
         f"cannot read the photo {photo.view.name}",
         str(error),
-        "Run stage ingest again (--from ingest), or use --mesh.no-refine --mesh.texture-size 0, which need no photos.",
+        "Decode it again: pipeline ingest WORKSPACE --force. Or use none: --mesh.no-refine --mesh.texture-size 0.",
     )
 
 

@@ -129,8 +129,8 @@ def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress |
     if chosen is not wanted and progress:
         progress.note(
             "train.memory-limits-grids",
-            f"{_grids(chosen)}: {_grids(wanted)}, which the budget allows, take {bytes_in_words(bytes_of(wanted))} "
-            f"during training, and only {bytes_in_words(free)} of memory are free",
+            f"{_grids(chosen)}: {_grids(wanted)}, which the training time allows, take "
+            f"{bytes_in_words(bytes_of(wanted))} during training, and only {bytes_in_words(free)} of memory are free",
         )
     return config.filled({"grid": chosen})
 

@@ -26,13 +26,13 @@ class HashGridOptions(Options):
         description="Micro-batches per step, one per core at a time (default: the number of cores).",
     )
     num_levels: Auto[int] = Field(
-        default=None, ge=1, le=16, description="Number of resolution levels (default: as the budget allows)."
+        default=None, ge=1, le=16, description="Number of resolution levels (default: as the training time allows)."
     )
     log2_hashmap_size: Auto[int] = Field(
         default=None,
         ge=8,
         le=24,
-        description="Entries of the hash table of a level, as a power of 2 (default: as the budget allows).",
+        description="Entries of the hash table of a level, as a power of 2 (default: as the training time allows).",
     )
     max_res: Auto[int] = Field(
         default=None,

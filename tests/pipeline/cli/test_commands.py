@@ -54,7 +54,7 @@ def test_help_of_run_lists_the_stage_options(capsys: pytest.CaptureFixture[str])
         (["--train.grid.max-res", "9"], "--train.grid.max-res 9 must be at least 16 (pipeline run --help)"),
         (["--train.grid.max-res", "64", "--train.field", "vanilla"],
          "--train.grid.max-res has no effect with --train.field vanilla; leave out one of the two"),
-        (["--train.steps", "5", "--train.seconds", "5"], "--train.steps 5 and --train.seconds 5 are two budgets"),
+        (["--train.steps", "5", "--train.seconds", "5"], "--train.steps 5 and --train.seconds 5 both set"),
         (["--train.steps", "many"], "--train.steps: 'many' is not a whole number (pipeline run --help)"),
         (["--train.field", "foo"], "--train.field: 'foo' is not one of grid, vanilla (pipeline run --help)"),
         (["--sfm.seed", "one"], "--sfm.seed: 'one' is not a whole number (pipeline run --help)"),
@@ -406,4 +406,4 @@ def test_a_budget_and_more_are_two_budgets(
     (tmp_path / "w/run.json").write_text('{"version": 2, "options": {}, "plans": {}, "keys": {}}')
     words = ["run", str(tmp_path), "-o", str(tmp_path / "w"), "--more", "10m", "--budget", "5m"]
     assert run_command(words) == 2
-    assert "--budget and --more are two budgets; give one" in capsys.readouterr().err
+    assert "--budget and --more both limit the time; give one" in capsys.readouterr().err

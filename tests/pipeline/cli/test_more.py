@@ -96,8 +96,8 @@ def test_an_interrupted_more_is_taken_up_by_the_same_words(trained, monkeypatch:
     [
         (["--more", "10"], 2, "'10' is not a duration; write it like 90s, 10m or 1h30m"),
         (["--more", "0steps"], 2, "--more needs at least one step"),
-        (["--more", "5steps", "--train.steps", "99"], 2, "--more and --train.steps are two budgets; give one"),
-        (["--more", "5steps", "--train.preset", "high"], 2, "--more and --train.preset are two budgets; give one"),
+        (["--more", "5steps", "--train.steps", "99"], 2, "--more and --train.steps both set the training time"),
+        (["--more", "5steps", "--train.preset", "high"], 2, "--more and --train.preset both set the training time"),
         (["--more", "5steps", "--train.learning-rate", "0.5"], 14, "Give --train.learning-rate 0.02. Train"),
     ],
 )

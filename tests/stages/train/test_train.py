@@ -234,7 +234,7 @@ def test_test_photos_of_which_masks_leave_nothing_stop_no_training(tmp_path: Pat
 
 
 def test_two_budgets_are_refused_in_words() -> None:
-    with pytest.raises(ValidationError, match=r"--train\.steps 500 and --train\.seconds 60 are two budgets; give one"):
+    with pytest.raises(ValidationError, match=r"--train\.steps 500 and --train\.seconds 60 both set the training time"):
         Config(steps=500, seconds=60)
 
 
