@@ -11,7 +11,7 @@ POINTS = [{"seconds": 10.0 * 2**k, "probe_psnr": 20.0 + k} for k in range(5)]
 def test_doublings_are_of_training_time() -> None:
     last = "the last doubling of training time, to 2 min 40 s, gained +1.0 dB on test pixels"
     assert doubling_message(POINTS, None) == last
-    less = "(less over a run of half the time, which would have ended above this curve)"
+    less = "(a separate run of half the time would end higher, so the gain over it is smaller)"
     told = doubling_message(POINTS, PredictedGain(0.71, 0.37)) or ""
     assert told.startswith(f"{last} {less}; ") and "--more 160s" in told and "+0.7 dB (± 0.4)" in told
     assert doubling_message(POINTS[-1:], None) is None
