@@ -195,9 +195,9 @@ def family_of(variant: str) -> str:
 
 
 def grid_sizes(size: GridSize, space: Space) -> dict[str, int]:
-    """Sizes of a grid field: those that stage train has on a CPU for long runs (``usual``) and for short ones, whatever
-    the size of the photos, and larger still, by one grid, twice the rows and twice the cells along an axis."""
-    (_, *usual), (_, *small) = hash_grid.SIZES[space]
+    """Sizes of a grid field: those that stage train has on a CPU for a few minutes (``usual``) and for shorter runs,
+    whatever the size of the photos, and larger still, by one grid, twice the rows and twice the cells along an axis."""
+    *_, (_, *usual), (_, *small) = hash_grid.SIZES[space]
     large = (usual[0] + 1, usual[1] + 1, 2 * usual[2])
     of = {"small": small, "usual": usual, "large": large}
     return dict(zip(("num_levels", "log2_hashmap_size", "max_res"), of[size], strict=True))

@@ -19,7 +19,7 @@ from stages.io.amounts import bytes_in_words, short_count
 from stages.train.config import Config
 from stages.train.data import has_background_model, training_background
 from stages.train.fields.hash_grid_options import MAX_MICRO_BATCHES
-from stages.train.fields.space import map_without_scene, space_map_of
+from stages.train.fields.space import map_without_scene, space_map_of, width_in_photos
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
@@ -65,11 +65,12 @@ MAX_SAMPLES = 1024
 SAMPLES_PER_RAY = {"bounded": 3, "contracted": 10, "ndc": 6}
 """Colours computed for a ray, over a run: measured on lego_400 and five photo sets."""
 SIZES = {
-    "bounded": ((50e6, 5, 18, 512), (0, 4, 17, 256)),
-    "contracted": ((30e6, 6, 18, 1024), (0, 5, 17, 512)),
-    "ndc": ((30e6, 6, 18, 1024), (0, 5, 17, 512)),
+    "bounded": ((130e6, 6, 19, 512), (50e6, 5, 18, 512), (0, 4, 17, 256)),
+    "contracted": ((130e6, 8, 19, 2048), (30e6, 6, 18, 1024), (0, 5, 17, 512)),
+    "ndc": ((30e6, 8, 19, 2048), (0, 5, 17, 512)),
 }
-"""(computed colours from which on it pays, num_levels, log2_hashmap_size, most max_res), the largest first."""
+"""(computed colours from which on it pays, num_levels, log2_hashmap_size, most max_res), the largest first
+(docs/experiments/cell_sizes.md)."""
 # The same on a GPU, which reads a large table as fast as a small one.
 GPU_SIZES = {"bounded": (200e6, 8, 20, 1024), "contracted": (200e6, 8, 20, 2048), "ndc": (200e6, 8, 20, 2048)}
 MIN_MAX_RES = 128
@@ -105,7 +106,7 @@ def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress |
     """``config`` with the sizes, where open, of a field that sees ``rays`` at its ``downscale``: more and larger tables
     where there are enough to fill them, and MAX_MEMORY_SHARE holds what their training takes; else the next smaller
     ones, and ``progress`` is told. The finest cells are about as wide as a pixel where the region of interest fills the
-    photo."""
+    photo, in normalised device coordinates at any depth."""
     assert config.downscale is not None
     samples, device = rays * SAMPLES_PER_RAY[_space(config)], compute_device()
     sizes = SIZES[_space(config)]
@@ -113,7 +114,7 @@ def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress |
         sizes = (GPU_SIZES[_space(config)], *sizes)
     cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
     pixels = max(max(camera.width, camera.height) for camera in cameras) / config.downscale
-    across = 2 ** math.ceil(math.log2(pixels * (Contraction.half / Box.half if config.space == "contracted" else 1)))
+    across = 2 ** math.ceil(math.log2(pixels * _width_in_photos(config, scene)))
     wanted, *smaller = (
         _size(levels, log2_size, max(MIN_MAX_RES, min(most, across)))
         for least, levels, log2_size, most in sizes
@@ -135,6 +136,13 @@ def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress |
     return config.filled({"grid": chosen})
 
 
+def _width_in_photos(config: Config, scene: "Scene") -> float:
+    """How many times as wide as a photo, whose width the region of interest fills, all of mapped space is."""
+    if isinstance(pyramid := space_map_of(config, scene), Ndc):
+        return width_in_photos(pyramid, scene)
+    return Contraction.half / Box.half if config.space == "contracted" else 1.0
+
+
 def _space(config: Config) -> Space:
     """Whose measured constants count."""
     assert config.space is not None, "plan() chooses it"
@@ -150,8 +158,8 @@ def _grids(size: dict[str, int]) -> str:
 
 
 def timed(config: Config) -> Config:
-    """``config`` under which speed is measured before sizes are known: those which most budgets get."""
-    _, *size = SIZES[_space(config)][0]
+    """``config`` under which speed is measured before sizes are known: those of a few minutes."""
+    _, *size = SIZES[_space(config)][-2]
     return config.filled({"grid": _size(*size)})
 
 

@@ -146,7 +146,7 @@ def test_grids_grow_with_rays_and_pixels(
     assert all(more_rays[name] >= small[name] >= fewer_pixels[name] for name in small)
     field = field_settings(with_grid(config, **small), background_model=False)
     assert isinstance(field, HashGridSettings)
-    assert 128 <= field.max_res <= 1024
+    assert 128 <= field.max_res <= (2048 if contracted else 512)
     # Two neighbouring samples lie in the same or in neighbouring cells of the finest grid, near the cameras at least.
     cells_per_step = field.stepping.step_size * field.max_res / (4 if contracted else 1.8)
     in_contracted_space = 1 / 3 if field.max_res <= 512 else 2 / 3
@@ -229,9 +229,9 @@ def test_the_reason_for_sizes_is_the_budget() -> None:
 
 
 CONTRACTED = GRID.model_copy(update={"space": "contracted", "downscale": 1.0})
-LARGEST, SMALLEST = (
+LARGEST, MIDDLE, SMALLEST = (
     {"num_levels": levels, "log2_hashmap_size": log2_size, "max_res": max_res}
-    for levels, log2_size, max_res in ((6, 18, 1024), (5, 17, 512))
+    for levels, log2_size, max_res in ((8, 19, 2048), (6, 18, 1024), (5, 17, 512))
 )
 NEEDED = memory_bytes(with_grid(CONTRACTED, **LARGEST))
 
@@ -240,7 +240,7 @@ NEEDED = memory_bytes(with_grid(CONTRACTED, **LARGEST))
     "free, own, chosen",
     [
         (2 * NEEDED, {}, LARGEST),
-        (2 * NEEDED - 1, {}, SMALLEST),
+        (2 * NEEDED - 1, {}, MIDDLE),
         (0.0, {}, SMALLEST),
         (2 * NEEDED, {"log2_hashmap_size": 20}, SMALLEST),
     ],
@@ -252,8 +252,9 @@ def test_grids_take_half_of_the_free_memory_at_most(
     config = with_grid(CONTRACTED, **own)
     assert sizes_of(config, of_size(scene, 4000, 3000), 1e9, progress) == chosen | own
     assert progress.codes == ["train.memory-limits-grids"] * (chosen is not LARGEST)
-    got = f"5 grids of up to 2^{chosen['log2_hashmap_size']} rows"
-    assert progress.names("train.memory-limits-grids", got, "6 grids of up to 2^18 rows") == (chosen is not LARGEST)
+    size = chosen | own
+    got = f"{size['num_levels']} grids of up to 2^{size['log2_hashmap_size']} rows"
+    assert progress.names("train.memory-limits-grids", got, "8 grids of up to 2^") == (chosen is not LARGEST)
 
 
 @pytest.mark.parametrize(

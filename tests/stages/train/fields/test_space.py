@@ -16,6 +16,7 @@ from stages.effects.decisions import Decisions, Space
 from stages.train.config import Config
 from stages.train.data import camera_directions
 from stages.train.fields.field_list import make_trainer, with_defaults
+from stages.train.fields.hash_grid import with_sizes
 from stages.train.fields.hash_grid_options import HashGridOptions
 from stages.train.fields.space import MAX_NEAR_RATIO, MAX_WIDTH, chosen_space, near_ratio, space_map_of, width_in_photos
 from tests.camera_layouts import ring, wall
@@ -89,6 +90,14 @@ def test_the_width_decides_between_two_pyramids() -> None:
         assert isinstance(pyramid, Ndc)
         widths.append(width_in_photos(pyramid, scene))
     assert 1 < widths[0] < MAX_WIDTH < widths[1]
+
+
+@pytest.mark.parametrize(("spread_deg", "max_res"), [(0.0, 1024), (10.0, 2048)])
+def test_finest_cells_are_a_pixel_wide(spread_deg: float, max_res: int) -> None:
+    """A frustum wider than the photos, of 1,000 pixels, has more of them."""
+    large = replace(scene_of(fanned(spread_deg)), cameras=(Camera("PINHOLE", 1000, 750, (1000.0, 1000.0, 500.0, 375.0)),))
+    config = Config(space="ndc", view_dependence=True, downscale=1.0, grid=HashGridOptions(target_samples=4096))
+    assert with_sizes(config, large, 1e9).grid.max_res == max_res
 
 
 def test_the_near_ratio_grows_with_the_walk() -> None:
