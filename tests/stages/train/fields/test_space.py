@@ -95,7 +95,9 @@ def test_the_width_decides_between_two_pyramids() -> None:
 @pytest.mark.parametrize(("spread_deg", "max_res"), [(0.0, 1024), (10.0, 2048)])
 def test_finest_cells_are_a_pixel_wide(spread_deg: float, max_res: int) -> None:
     """A frustum wider than the photos, of 1,000 pixels, has more of them."""
-    large = replace(scene_of(fanned(spread_deg)), cameras=(Camera("PINHOLE", 1000, 750, (1000.0, 1000.0, 500.0, 375.0)),))
+    large = replace(
+        scene_of(fanned(spread_deg)), cameras=(Camera("PINHOLE", 1000, 750, (1000.0, 1000.0, 500.0, 375.0)),)
+    )
     config = Config(space="ndc", view_dependence=True, downscale=1.0, grid=HashGridOptions(target_samples=4096))
     assert with_sizes(config, large, 1e9).grid.max_res == max_res
 
