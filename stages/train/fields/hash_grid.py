@@ -47,7 +47,7 @@ MIN_PHOTOS = 3
 # (docs/experiments/few_photos.md).
 BASE_RES = {"bounded": 16, "contracted": 8, "ndc": 8}
 # Samples along a ray (docs/experiments/ray_samples.md).
-MAX_STEPS = 576  # bounded scenes: steps along the diagonal of the box
+MAX_STEPS = 576  # bounded scenes: steps along the diagonal of the box, or as many as the finest cells along an axis
 # Steps along the diagonal of normalised device coordinates, 1.7 times as many as from near to infinity, for one of the
 # finest cells along an axis: photos that stand next to each other see a thing move by some pixel from one to the next
 # (docs/experiments/forward_facing.md).
@@ -65,7 +65,7 @@ MAX_SAMPLES = 1024
 SAMPLES_PER_RAY = {"bounded": 3, "contracted": 10, "ndc": 6}
 """Colours computed for a ray, over a run: measured on lego_400 and five photo sets."""
 SIZES = {
-    "bounded": ((130e6, 6, 19, 512), (50e6, 5, 18, 512), (0, 4, 17, 256)),
+    "bounded": ((200e6, 8, 19, 1024), (50e6, 5, 18, 512), (0, 4, 17, 256)),
     "contracted": ((130e6, 8, 19, 2048), (30e6, 6, 18, 1024), (0, 5, 17, 512)),
     "ndc": ((30e6, 8, 19, 2048), (0, 5, 17, 512)),
 }
@@ -238,13 +238,14 @@ def make_trainer(
 
 def field_settings(config: Config, background_model: bool, space: SpaceMap | None = None) -> HashGridSettings:
     """Sizes of the field. Samples stand as close as the finest cells can tell them apart: in contracted space a third
-    to two thirds of a cell near the camera, growing with the distance, as pixels do; in a box a cell, or MAX_STEPS in
-    all. Sizes and steps alone need no ``space`` of a scene."""
+    to two thirds of a cell near the camera, growing with the distance, as pixels do; in a box a cell, or more where
+    MAX_STEPS says so. Sizes and steps alone need no ``space`` of a scene."""
     grid = config.grid
     assert grid.num_levels and grid.log2_hashmap_size and grid.max_res, "plan() chooses them"
     assert config.space is not None and config.view_dependence is not None, "plan() chooses them"
     across = math.sqrt(3) * grid.max_res
-    steps = NDC_STEPS_PER_CELL * grid.max_res if config.space == "ndc" else min(across, MAX_STEPS)
+    in_box = min(across, max(MAX_STEPS, grid.max_res))
+    steps = NDC_STEPS_PER_CELL * grid.max_res if config.space == "ndc" else in_box
     shortest = 2 * Contraction.half / (_steps_across(grid.max_res) * grid.ray_samples)
     return HashGridSettings(
         num_levels=grid.num_levels,

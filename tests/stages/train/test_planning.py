@@ -146,12 +146,12 @@ def test_grids_grow_with_rays_and_pixels(
     assert all(more_rays[name] >= small[name] >= fewer_pixels[name] for name in small)
     field = field_settings(with_grid(config, **small), background_model=False)
     assert isinstance(field, HashGridSettings)
-    assert 128 <= field.max_res <= (2048 if contracted else 512)
+    assert 128 <= field.max_res <= (2048 if contracted else 1024)
     # Two neighbouring samples lie in the same or in neighbouring cells of the finest grid, near the cameras at least.
     cells_per_step = field.stepping.step_size * field.max_res / (4 if contracted else 1.8)
     in_contracted_space = 1 / 3 if field.max_res <= 512 else 2 / 3
     assert cells_per_step == pytest.approx(
-        in_contracted_space if contracted else max(1, math.sqrt(3) * field.max_res / 576), rel=0.01
+        in_contracted_space if contracted else max(1, math.sqrt(3) * field.max_res / max(576, field.max_res)), rel=0.01
     )
 
 
