@@ -268,6 +268,8 @@ class Stage(Generic[C]):
     limiting_seconds: Callable[[Mapping[str, Any]], float | None] = lambda _: None
     """For a stage whose ``seconds`` have a limit without a budget as well: what that limit follows from in the options
     of all stages, None for no limit."""
+    less_memory: str = ""
+    """What may be given where memory is short: "a larger --train.downscale"."""
 
     def inputs_of(self, config: C) -> tuple[str, ...]:
         """The stages whose finished folders it reads under these options."""

@@ -4,19 +4,11 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
-from stages.contract import StageError
+from stages.contract import Stage, StageError
 from stages.io.files import read_json, write_durably
 
-LESS_MEMORY = {  # what else may be tried, by stage
-    "sfm": ", or give a smaller --sfm.max-image-size or --sfm.max-features",
-    "depth": ", or give a larger --depth.downscale",
-    "train": ", or give a larger --train.downscale",
-    "evaluate": ", or give a larger --evaluate.downscale",
-    "render": ", or give a smaller --render.width",
-    "mesh": ", or give a smaller --mesh.resolution",
-    "tradeoff": ", or give a larger --tradeoff.downscale",
-}
 FAILURE = "failure.json"  # in a partial folder: what ended the last attempt at the stage, or at its plan
 
 
@@ -29,20 +21,20 @@ class StageFailed(Exception):
 
 
 @contextmanager
-def worded(stage: str) -> Iterator[None]:
+def worded(stage: Stage[Any]) -> Iterator[None]:
     """Whatever a user can act on becomes a StageFailed."""
     try:
         yield
     except StageError as error:
-        raise StageFailed(stage, error) from error
+        raise StageFailed(stage.name, error) from error
     except OSError as error:
-        raise StageFailed(stage, _disk_error(error)) from error
+        raise StageFailed(stage.name, _disk_error(error)) from error
     except (MemoryError, RuntimeError) as error:
         if not _is_out_of_memory(error):
             raise
-        hint = f"Close other programs{LESS_MEMORY.get(stage, '')}."
-        why = str(error).splitlines()[0] if str(error) else f"{stage} needs more memory than there is"
-        raise StageFailed(stage, StageError("pipeline.out-of-memory", "out of memory", why, hint)) from error
+        hint = f"Close other programs, or give {stage.less_memory}." if stage.less_memory else "Close other programs."
+        why = str(error).splitlines()[0] if str(error) else f"{stage.name} needs more memory than there is"
+        raise StageFailed(stage.name, StageError("pipeline.out-of-memory", "out of memory", why, hint)) from error
 
 
 def _is_out_of_memory(error: Exception) -> bool:
@@ -60,7 +52,7 @@ def _disk_error(error: OSError) -> StageError:
 
 
 @contextmanager
-def recorded(stage: str, partial: Path) -> Iterator[None]:
+def recorded(stage: Stage[Any], partial: Path) -> Iterator[None]:
     """What ``stage`` fails of, raised as StageFailed, is written into a partial folder, for ``status``; that of an
     earlier attempt goes."""
     file = partial / FAILURE

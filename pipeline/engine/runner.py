@@ -172,7 +172,7 @@ class Runner:
         self.started[stage] = time.monotonic()
         self.display.begin(stage)
         try:
-            with worded(stage):
+            with worded(STAGES[stage]):
                 job, manifest, ran = self._found_or_made(stage)
                 self.workspace.link_outputs(self.workspace.folder(stage, job.key), job.stage.published)
                 self.workspace.write_run(self.run_file)
@@ -300,7 +300,7 @@ class Runner:
         self._check_inputs(stage, folders)
         self.budget.begin(stage, self.times.get(stage))
         clock, unplanned = time.monotonic(), self.workspace.partial(stage, asked)
-        with recorded(stage, unplanned), counting(self.workspace.root / RUNNING):
+        with recorded(STAGES[stage], unplanned), counting(self.workspace.root / RUNNING):
             config = plan_stage(declared, self._with_time(stage, options), folders, self.display)
         shutil.rmtree(unplanned, ignore_errors=True)
         self.planning[stage] = time.monotonic() - clock
@@ -352,7 +352,11 @@ class Runner:
         self.workspace.write_run(self.run_file)
         started = datetime.now(UTC)
         self.running = name
-        with recorded(name, partial), counting(self.workspace.root / RUNNING), counting(partial / ATTEMPTS) as spent:
+        with (
+            recorded(stage, partial),
+            counting(self.workspace.root / RUNNING),
+            counting(partial / ATTEMPTS) as spent,
+        ):
             result = stage.run(job.config, job.folders, partial, self.display)
         outputs = manifests.describe_outputs(partial, result.outputs)
         manifest = Manifest(

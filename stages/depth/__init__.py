@@ -63,4 +63,5 @@ STAGE = Stage(
     run=run,
     on_request=True,
     expected_seconds=expected_seconds,
+    less_memory="a larger --depth.downscale",
 )

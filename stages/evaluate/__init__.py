@@ -86,4 +86,5 @@ STAGE = Stage(
     run=run,
     expected_seconds=expected_seconds,
     flexible=Flexible(share=0.05, min_seconds=3.0, max_seconds=60.0),
+    less_memory="a larger --evaluate.downscale",
 )

@@ -175,4 +175,5 @@ STAGE = Stage(
     run=run,
     expected_seconds=expected_seconds,
     flexible=Flexible(share=0.12, min_seconds=8.0, max_seconds=60.0),
+    less_memory="a smaller --mesh.resolution",
 )

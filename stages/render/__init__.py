@@ -120,4 +120,5 @@ STAGE = Stage(
     run=run,
     expected_seconds=expected_seconds,
     flexible=Flexible(share=0.15, min_seconds=4.0, max_seconds=300.0),
+    less_memory="a smaller --render.width",
 )

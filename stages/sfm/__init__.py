@@ -205,4 +205,5 @@ STAGE = Stage(
     run=run,
     expected_seconds=expected_seconds,
     budget_seconds=budget_seconds,
+    less_memory="a smaller --sfm.max-image-size or --sfm.max-features",
 )

@@ -76,4 +76,5 @@ STAGE = Stage(
     # A user waits for the field, so it gets most of what is left; figures, a video and a mesh are there to see it by. A
     # training of less than half a minute is worth none.
     flexible=Flexible(share=0.68, min_seconds=30.0, max_share=1.0, reads_photos=True, work=step_seconds),
+    less_memory="a larger --train.downscale",
 )

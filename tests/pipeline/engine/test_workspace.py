@@ -18,6 +18,7 @@ from pipeline.cli.commands import run_command
 from pipeline.engine.failures import StageFailed, recorded
 from pipeline.engine.manifests import Manifest, describe_outputs, outputs_digest
 from pipeline.engine.run_file import RunFile
+from pipeline.engine.stage_list import STAGES
 from pipeline.engine.status import status_of
 from pipeline.engine.workspace import COPIES, Workspace
 from stages.contract import StageError
@@ -154,14 +155,14 @@ def test_status_tells_a_failure_from_an_interruption(tmp_path: Path):
     workspace = Workspace(tmp_path)
     partial = workspace.partial("mesh", KEY)
     partial.mkdir(parents=True)
-    with pytest.raises(StageFailed), recorded("mesh", partial):
+    with pytest.raises(StageFailed), recorded(STAGES["mesh"], partial):
         raise StageError("mesh.empty", "there is no surface", "the field is empty", "Train longer.")
     found = status_of(workspace, runner, "mesh")
     assert (found.state, found.text) == ("failed", f"there is no surface; `pipeline resume {tmp_path}` tries again")
-    with pytest.raises(StageFailed), recorded("mesh", partial):
+    with pytest.raises(StageFailed), recorded(STAGES["mesh"], partial):
         raise OSError(28, "No space left on device")
     assert status_of(workspace, runner, "mesh").state == "failed"
-    with suppress(KeyboardInterrupt), recorded("mesh", partial):
+    with suppress(KeyboardInterrupt), recorded(STAGES["mesh"], partial):
         raise KeyboardInterrupt
     assert status_of(workspace, runner, "mesh").state == "partial"
 
