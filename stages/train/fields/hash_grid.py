@@ -67,7 +67,7 @@ SAMPLES_PER_RAY = {"bounded": 3, "contracted": 10, "ndc": 6}
 SIZES = {
     "bounded": ((200e6, 8, 19, 1024), (50e6, 5, 18, 512), (0, 4, 17, 256)),
     "contracted": ((130e6, 8, 19, 2048), (30e6, 6, 18, 1024), (0, 5, 17, 512)),
-    "ndc": ((30e6, 8, 19, 2048), (0, 5, 17, 512)),
+    "ndc": ((130e6, 8, 19, 2048), (30e6, 6, 18, 1024), (0, 5, 17, 512)),
 }
 """(computed colours from which on it pays, num_levels, log2_hashmap_size, most max_res), the largest first
 (docs/experiments/cell_sizes.md)."""
