@@ -103,9 +103,10 @@ def test_killed_while_photos_are_matched(photos_and_a_stranger: Path, tmp_path: 
     for instant in SFM_INSTANTS:
         program = sfm("killed.nerf")
         assert program.wait_until(partial(reached, instant)), f"no kill at: {instant}"
+        last = instant == "final bundle adjustment"  # which a fast machine may be done with before it is killed
         program.process.join(delays.uniform(0.0, 0.1))
         program.strike(signal.SIGKILL)
-        assert program.wait() == -signal.SIGKILL
+        assert program.wait() == -signal.SIGKILL or last
     events = sfm("killed.nerf").finish().events()
     done = {event["done"] for event in events if event["event"] == "progress" and event["stage"] == "sfm"}
     assert done <= {None, FEATURES_FOUND, REFINING}, "only the final bundle adjustment was left to do"
