@@ -25,11 +25,11 @@ import numpy as np
 from benchmarks.record import Record, add_out
 from benchmarks.retrieval import draw
 from nerf.geometry.alignment import align
+from pipeline.engine.stage_list import STAGES
 from stages.io.files import read_json
 from stages.io.photos import read_photos
 from stages.sfm.colmap.models import read_model
 
-STAGES = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "viewer", "report")
 SAMPLE_SECONDS = 0.5
 
 
@@ -91,8 +91,9 @@ def plot(rows: list[dict[str, Any]], file: Path) -> None:
     """Seconds of every stage against photos, both axes logarithmic, beside what grows in proportion."""
     figure, axes = plt.subplots(figsize=(7, 4.5), layout="constrained")
     photos = [row["photos"] for row in rows]
-    for stage in STAGES:
-        axes.loglog(photos, [row.get(f"{stage}_seconds") for row in rows], marker="o", label=stage)
+    for key in (f"{stage}_seconds" for stage in STAGES):
+        if key in rows[-1]:
+            axes.loglog(photos, [row.get(key) for row in rows], marker="o", label=key.removesuffix("_seconds"))
     each = rows[0]["sfm_seconds"] / rows[0]["photos"]
     axes.loglog(photos, [each * count for count in photos], "k:", label="∝ photos")
     axes.set(xlabel="photos", ylabel="seconds")

@@ -24,7 +24,6 @@ COLUMNS = {  # key: heading, format
     "seconds": ("s", ","),
     "frame_seconds": ("frame (s)", ",.2f"),
     "rays_per_second": ("rays/s", ",.0f"),
-    "colours_per_second": ("samples/s", ",.0f"),
     "reprojection_px": ("reprojection (px)", ".2f"),
     "width_share": ("width", ".0%"),
 }

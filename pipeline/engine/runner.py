@@ -352,11 +352,7 @@ class Runner:
         self.workspace.write_run(self.run_file)
         started = datetime.now(UTC)
         self.running = name
-        with (
-            recorded(stage, partial),
-            counting(self.workspace.root / RUNNING),
-            counting(partial / ATTEMPTS) as spent,
-        ):
+        with recorded(stage, partial), counting(self.workspace.root / RUNNING), counting(partial / ATTEMPTS) as spent:
             result = stage.run(job.config, job.folders, partial, self.display)
         outputs = manifests.describe_outputs(partial, result.outputs)
         manifest = Manifest(

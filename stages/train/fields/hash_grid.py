@@ -138,9 +138,8 @@ def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress |
 
 def _width_in_photos(config: Config, scene: "Scene") -> float:
     """How many times as wide as a photo, whose width the region of interest fills, all of mapped space is."""
-    if isinstance(pyramid := space_map_of(config, scene), Ndc):
-        return width_in_photos(pyramid, scene)
-    return Contraction.half / Box.half if config.space == "contracted" else 1.0
+    space = space_map_of(config, scene)
+    return width_in_photos(space, scene) if isinstance(space, Ndc) else space.half / Box.half
 
 
 def _space(config: Config) -> Space:
