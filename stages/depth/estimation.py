@@ -17,10 +17,10 @@ from nerf.runtime.parallel import in_order, take_over_cores, workers
 from stages.contract import Inputs, Progress, StageError, StageResult, listed
 from stages.depth.consistency import Candidate, agreed, plausible
 from stages.depth.files import FOLDER, depth_map_file, read_depth_map, write_depth_map
-from stages.depth.matching import MAX_VOLUME_BYTES, candidates, cost_volume_bytes
 from stages.depth.photos import KEPT_PHOTOS, TrainingPhotos, one_thread_each, read_training_photos
 from stages.depth.point_cloud import ReadMap, fuse, ply_bytes
 from stages.depth.rectification import Rectified
+from stages.depth.stereo_matching import MAX_VOLUME_BYTES, candidates, cost_volume_bytes
 from stages.hardware.cluster import fan_out
 from stages.hardware.memory import check_memory
 from stages.io.amounts import short_count

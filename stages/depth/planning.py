@@ -4,8 +4,8 @@ import time
 from typing import TYPE_CHECKING
 
 from stages.contract import Inputs, Progress
-from stages.depth.matching import candidates
 from stages.depth.photos import TrainingPhotos, one_thread_each, read_training_photos
+from stages.depth.stereo_matching import candidates
 from stages.hardware.device import processors
 from stages.io.files import read_scene
 

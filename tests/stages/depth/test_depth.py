@@ -13,7 +13,7 @@ import pytest
 from nerf.runtime import parallel
 from stages import depth
 from stages.contract import Inputs, Photos, StageResult, Workload, plan_stage
-from stages.depth import Config, estimation, files, matching
+from stages.depth import Config, estimation, files, stereo_matching
 from stages.depth.files import depth_map_file, read_depth_map
 from stages.hardware import cluster
 from tests.conftest import RecordedProgress
@@ -189,7 +189,7 @@ def test_too_little_memory_is_said_beforehand(inputs, tmp_path, monkeypatch) -> 
 
 
 def test_large_pairs_are_matched_in_little_memory(inputs, undisturbed, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(matching, "MAX_VOLUME_BYTES", 0)
+    monkeypatch.setattr(stereo_matching, "MAX_VOLUME_BYTES", 0)
     coverage = result_of(inputs, tmp_path)[0].facts["coverage"]
     assert coverage == pytest.approx(undisturbed[0].facts["coverage"], abs=0.1)
     assert coverage != undisturbed[0].facts["coverage"]
