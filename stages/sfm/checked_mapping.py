@@ -30,8 +30,8 @@ from stages.sfm.colmap.model_check import (
 )
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import copy_consistent_matches, deregister, drop_outside_main_segment, register_again
+from stages.sfm.extraction_and_matching import capture_sequence, consecutive_pairs
 from stages.sfm.job import JobState
-from stages.sfm.matching import capture_sequence, consecutive_pairs
 from stages.sfm.retry_strategies import (
     FINAL_ADJUSTMENT_FACTOR,
     MIN_MISSING_TO_START_OVER,

@@ -24,8 +24,8 @@ from stages.sfm.colmap.diagnosis import find_conflict, links, supports
 from stages.sfm.colmap.model_check import check_model, facts, reasons
 from stages.sfm.colmap.models import load_native, turned_upright, write_native
 from stages.sfm.colmap.repair import deregister
+from stages.sfm.extraction_and_matching import capture_sequence, match_photos, relaxed_pairs
 from stages.sfm.job import Job, JobState, Send, end_with_parent
-from stages.sfm.matching import capture_sequence, match_photos, relaxed_pairs
 from stages.sfm.retry_strategies import (
     MIN_LONG_FOCAL,
     STRATEGIES,

@@ -94,7 +94,8 @@ def test_a_resumed_run_knows_its_earlier_time(
     pictures = sorted(synthetic_photos.folder.iterdir())[:6]
     folders = ingested(tmp_path / "ingest", {file.name: np.asarray(Image.open(file)) for file in pictures})
     killed = (
-        "import os, time, stages.sfm.worker as c, stages.sfm.job as job, stages.sfm.matching as matching\n"
+        "import os, time, stages.sfm.worker as c, stages.sfm.job as job\n"
+        "import stages.sfm.extraction_and_matching as matching\n"
         "job.SAVE_INTERVAL_SECONDS = 0.1\n"
         "matching.match_pairs = lambda *_: (time.sleep(3), os.kill(os.getpid(), 9))\n"
         "c.main()"

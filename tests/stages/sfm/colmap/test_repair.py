@@ -15,7 +15,7 @@ from stages.sfm.colmap.repair import (
     deregister,
     register_again,
 )
-from stages.sfm.matching import consecutive_pairs
+from stages.sfm.extraction_and_matching import consecutive_pairs
 from stages.sfm.retry_strategies import MappingOptions
 from tests.stages.sfm.colmap.made_models import PHOTOS, Made, mismatch, turned_alone, verified_pairs
 

@@ -1,4 +1,4 @@
-"""From photos to the matches that a strategy maps. Runs in the worker process of stage sfm."""
+"""Feature extraction and matching as a strategy asks for them. Runs in the worker process of stage sfm."""
 
 import shutil
 from functools import partial

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages.sfm import matching
+from stages.sfm import extraction_and_matching
 from stages.sfm.retry_strategies import STRATEGIES
 
 BY_NAME = {strategy.name: strategy for strategy in STRATEGIES}
@@ -33,12 +33,12 @@ def test_many_pairs_or_features_are_compared_by_the_inverted_file(
     matcher: str, name: str, compared: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given: list[bool] = []
-    monkeypatch.setattr(matching, "_extract", lambda *_: None)
-    monkeypatch.setattr(matching, "_match_all", lambda _, exact, __: given.append(exact))
-    monkeypatch.setattr(matching, "_match", lambda _, __, ___, exact, ____: given.append(exact))
-    monkeypatch.setattr(matching, "matched_pairs", lambda _: np.array([[0, 1], [0, 2], [1, 2]]))
-    monkeypatch.setattr(matching, "copy_without_matches_of", lambda *_: None)
-    matching.match_photos(BY_NAME[name], [2], state_of(3, matcher))
+    monkeypatch.setattr(extraction_and_matching, "_extract", lambda *_: None)
+    monkeypatch.setattr(extraction_and_matching, "_match_all", lambda _, exact, __: given.append(exact))
+    monkeypatch.setattr(extraction_and_matching, "_match", lambda _, __, ___, exact, ____: given.append(exact))
+    monkeypatch.setattr(extraction_and_matching, "matched_pairs", lambda _: np.array([[0, 1], [0, 2], [1, 2]]))
+    monkeypatch.setattr(extraction_and_matching, "copy_without_matches_of", lambda *_: None)
+    extraction_and_matching.match_photos(BY_NAME[name], [2], state_of(3, matcher))
     assert given == [compared == "exactly"]
 
 
@@ -54,6 +54,6 @@ def test_many_pairs_or_features_are_compared_by_the_inverted_file(
 def test_pairs_of_a_relaxed_ratio_test_are_foreseen(
     name: str, photos: int, matcher: str, missing: int, matched: int, pairs: int
 ) -> None:
-    assert matching.relaxed_pairs(BY_NAME[name], missing, matched, state_of(photos, matcher)) == pytest.approx(
-        pairs, rel=0.1
-    )
+    assert extraction_and_matching.relaxed_pairs(
+        BY_NAME[name], missing, matched, state_of(photos, matcher)
+    ) == pytest.approx(pairs, rel=0.1)
