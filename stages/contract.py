@@ -252,7 +252,7 @@ class Stage(Generic[C]):
     """``run(config, inputs, folder, progress)`` reads ``inputs[stage]`` (finished folders), writes its results into
     ``folder`` alone, and raises :class:`StageError` for everything a user can act on. ``config`` is planned. Two
     exceptions: ``--more`` reads the finished training that it continues, which is no input, from the same workspace
-    (stages/train/more.py), and pixel stores, a cache, lie beside ingest's folder (stages/io/pixel_store.py)."""
+    (stages/train/continuation.py), and pixel stores, a cache, lie beside ingest's folder (stages/io/pixel_store.py)."""
     on_request: bool = False
     """It runs only where it is named, or where an option of another stage asks for it (``more_inputs``), and no budget
     pays for it."""

@@ -10,7 +10,7 @@ from pipeline.engine.settings import Settings
 from pipeline.engine.stage_list import command_that_makes
 from pipeline.engine.workspace import Workspace
 from stages.contract import StageError
-from stages.train.more import training_name
+from stages.train.continuation import training_name
 
 _STEPS = re.compile(r"(\d+) ?steps?")
 

@@ -48,8 +48,8 @@ from stages.train.checkpoints import (
     non_finite_tensor,
     save_checkpoint,
 )
+from stages.train.continuation import cannot_continue
 from stages.train.live import LiveFolder
-from stages.train.more import cannot_continue
 from stages.train.profile import profiled_step
 from stages.train.state import (
     EvaluationSets,

@@ -20,10 +20,10 @@ from stages.io.amounts import bytes_in_words, duration, short_count
 from stages.io.files import read_json, read_scene
 from stages.io.photos import read_photos
 from stages.train.config import SECONDS, Config
+from stages.train.continuation import continued, finished_training_folder
 from stages.train.data import MIN_LONG_SIDE, camera_directions
 from stages.train.fields.field_list import field_of, make_trainer
 from stages.train.fields.space import chosen_space
-from stages.train.more import continued, finished_training_folder
 from stages.train.precision import chosen_precision
 
 if TYPE_CHECKING:

@@ -31,6 +31,7 @@ from stages.io.field_files import save_field
 from stages.io.files import read_scene
 from stages.train.checkpoints import checkpoint_files
 from stages.train.config import Config
+from stages.train.continuation import budget_of, earlier_seconds
 from stages.train.curve import (
     doubling_message,
     predicted_gain,
@@ -43,7 +44,6 @@ from stages.train.data import dataset_with_depths, field_background
 from stages.train.fields.field_list import field_of, make_trainer
 from stages.train.live import LiveFolder
 from stages.train.loop import TrainingRun
-from stages.train.more import budget_of, earlier_seconds
 from stages.train.precision import precision_facts, say_if_inexact
 from stages.train.profile import write_profile
 from stages.train.state import EvaluationSets, TrainingBudget, TrainingLog

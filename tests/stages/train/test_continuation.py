@@ -10,8 +10,8 @@ from nerf.geometry.scene import Camera, Scene
 from stages import train
 from stages.io.files import read_json, write_json
 from stages.train import Config
+from stages.train.continuation import training_name
 from stages.train.fields.vanilla_options import VanillaOptions
-from stages.train.more import training_name
 from stages.train.planning import larger_photos_words
 from tests.stages.photo_scene import photographed
 
