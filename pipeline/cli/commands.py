@@ -15,7 +15,7 @@ from pathlib import Path
 
 from pipeline.cli import arguments, exit_codes
 from pipeline.cli.durations import seconds_from
-from pipeline.cli.more import with_more
+from pipeline.cli.more_option import with_more
 from pipeline.cli.options import (
     UsageError,
     check_fitted_poses,
