@@ -13,7 +13,8 @@ from typing import IO, Any, NamedTuple
 from pipeline.batch.batch_file import SceneFailure
 from stages.hardware.child_process import child_environment
 
-COMMAND = ["-P", "-m", "pipeline.cli.attended", "run"]  # -P: nothing in the current folder is taken for a module
+# -P: nothing in the current folder is taken for a module.
+COMMAND = ["-P", "-m", "pipeline.cli.exit_with_parent", "run"]
 NO_REASON = {"why": "an option is wrong", "hint": "Correct it, and give the command again."}  # of a usage error
 ENDING_SECONDS = 120.0  # until a run whose parent was killed has ended, and its lock is free on shared storage, too
 FIGURES = ("photos", "registered", "psnr", "ssim", "cameras_doubtful")

@@ -238,7 +238,7 @@ def test_a_scene_ends_with_its_batch(scenes: Path, tmp_path: Path, signal_number
     slow.parent.mkdir()
     slow.write_text(
         "import os, sys, time\n"
-        "if 'pipeline.cli.attended' in ' '.join(sys.orig_argv):\n"
+        "if 'pipeline.cli.exit_with_parent' in ' '.join(sys.orig_argv):\n"
         "    import threading\n"
         f"    open({str(seen)!r}, 'w').write(str(os.getpid()))\n"
         "    from pipeline.cli import commands\n"

@@ -1,5 +1,5 @@
-"""``python -m pipeline.cli.attended WORDS``: the command line ``pipeline WORDS``, ended as by SIGTERM when the process
-that holds the other end of its standard input is gone."""
+"""``python -m pipeline.cli.exit_with_parent WORDS``: the command line ``pipeline WORDS``, ended as by SIGTERM when the
+process that holds the other end of its standard input is gone."""
 
 import os
 import signal
