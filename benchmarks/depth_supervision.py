@@ -26,7 +26,7 @@ from benchmarks.record import Record, add_out
 from nerf.rendering.images import render_image
 from nerf.runtime.parallel import take_over_cores
 from nerf.training.hash_grid_trainer import HashGridTrainer
-from nerf.training.metrics import psnr
+from nerf.training.psnr import psnr
 from nerf.training.ray_dataset import RayDataset
 from pipeline.engine.workspace import Workspace
 from stages.contract import Inputs, SilentProgress

@@ -25,7 +25,7 @@ from nerf.geometry.space_maps.contraction import Contraction
 from nerf.rendering.images import render_image
 from nerf.runtime.parallel import take_over_cores, workers
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
-from nerf.training.metrics import psnr
+from nerf.training.psnr import psnr
 from nerf.training.ray_dataset import RayDataset
 from stages.contract import SilentProgress
 from stages.effects.decisions import Space

@@ -33,7 +33,7 @@ from nerf.runtime.ranks import Ranks
 from nerf.training.data_parallel import LeadingTrainer
 from nerf.training.graph_trainer import GraphTrainer
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
-from nerf.training.metrics import mean_squared_error, psnr
+from nerf.training.psnr import mean_squared_error, psnr
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import FieldTrainer, composite_over
 

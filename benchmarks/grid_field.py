@@ -21,7 +21,7 @@ from nerf.kernels import warp as fast
 from nerf.rendering.images import render_image
 from nerf.runtime.parallel import take_over_cores, workers
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
-from nerf.training.metrics import mean_squared_error, psnr
+from nerf.training.psnr import mean_squared_error, psnr
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from nerf.training.trainer import composite_over
 

@@ -75,7 +75,7 @@ def train_ours(workspace: Path, downscale: float, seconds: float) -> Point:
 
 def score_ours(workspace: Path) -> float:
     """Mean PSNR over the held-out photos at the trained size, as stage evaluate scores them."""
-    from nerf.training.metrics import mean_squared_error, psnr
+    from nerf.training.psnr import mean_squared_error, psnr
     from stages.effects.image_effects import photo_effects
     from stages.io.files import read_json, read_scene
     from stages.render.renderer import load_renderer

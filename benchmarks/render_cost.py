@@ -19,7 +19,7 @@ from nerf.effects.appearance import AppearanceModel
 from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import RadianceModel
 from nerf.fields.vanilla import VanillaNerf
-from nerf.training.metrics import mean_squared_error, psnr
+from nerf.training.psnr import mean_squared_error, psnr
 from pipeline.engine.workspace import Workspace
 from stages.effects.image_effects import photo_effects
 from stages.io.amounts import resolution_name

@@ -15,7 +15,7 @@ from kornia.metrics import ssim
 
 from benchmarks.record import Record, add_out
 from benchmarks.renders import read_render_and_photo
-from nerf.training.metrics import psnr
+from nerf.training.psnr import psnr
 from stages.evaluate import tiles
 from stages.evaluate.image_metrics import SSIM_WINDOW
 from stages.io.files import read_json, read_scene

@@ -12,7 +12,7 @@ from nerf.fields.interface import RadianceModel, Rendering
 from nerf.geometry.rays import Rays
 from nerf.rendering.images import render_image
 from nerf.runtime.randomness import generator
-from nerf.training.metrics import mean_squared_error, psnr
+from nerf.training.psnr import mean_squared_error, psnr
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import composite_over
 

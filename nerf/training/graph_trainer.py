@@ -24,7 +24,7 @@ from nerf.fields.mlp import Weights
 from nerf.rendering.early_termination import RoundSize
 from nerf.runtime.profiler import is_profiling
 from nerf.training.hash_grid_trainer import HashGridBatch, HashGridTrainer, LossWeights, MicroBatch, joined
-from nerf.training.metrics import psnr
+from nerf.training.psnr import psnr
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite, StepResult, all_finite
 
 # A graph serves until the number of rays that steps should have is so far from its own: its rays, whose number stays,

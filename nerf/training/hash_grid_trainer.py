@@ -23,8 +23,8 @@ from nerf.runtime.randomness import generator
 from nerf.training.colour_loss import huber_loss
 from nerf.training.frustum_mask import compute_frustum_mask
 from nerf.training.learning_rate import lr_multiplier
-from nerf.training.metrics import psnr
 from nerf.training.pixel_sampler import PixelSampler
+from nerf.training.psnr import psnr
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite, StepResult, all_finite
 

@@ -16,8 +16,8 @@ from nerf.runtime.parallel import in_order
 from nerf.runtime.profiler import WorkCounts, span
 from nerf.runtime.randomness import generator
 from nerf.training.learning_rate import learning_rate
-from nerf.training.metrics import psnr
 from nerf.training.pixel_sampler import PixelSampler
+from nerf.training.psnr import psnr
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import RAY_GEOMETRY, NonFinite, StepResult, all_finite, composite_over
 

@@ -16,7 +16,7 @@ from nerf.effects.pose_refinement import fit_pose
 from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
-from nerf.training.metrics import mean_squared_error, psnr
+from nerf.training.psnr import mean_squared_error, psnr
 
 MIN_PIXELS = 64  # of a half
 

@@ -14,7 +14,7 @@ from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from nerf.geometry.scene import Scene, View
-from nerf.training.metrics import mean_squared_error, psnr
+from nerf.training.psnr import mean_squared_error, psnr
 from stages.contract import Inputs, Note, Progress, StageError, StageResult
 from stages.effects.image_effects import held_out_words, photo_effects, refines_poses
 from stages.evaluate.baselines import MeanPhoto, mean_photo, nearest_view, resized

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from nerf.geometry.rays import Rays
 from nerf.geometry.scene import Scene, View
-from nerf.training.metrics import psnr
+from nerf.training.psnr import psnr
 from stages import train
 from stages.contract import Inputs, Progress, StageError, run_stage
 from stages.effects.image_effects import photo_effects

@@ -16,7 +16,7 @@ from nerf.effects.exposure import ExposureModel
 from nerf.effects.vignetting import VignettingModel
 from nerf.fields.hash_grid import HashGridField
 from nerf.geometry.scene import Camera, Scene, View
-from nerf.training.metrics import mean_squared_error, psnr
+from nerf.training.psnr import mean_squared_error, psnr
 from stages.contract import Inputs, Progress, StageError
 from stages.effects.image_effects import new_view_effects, new_view_words, photo_effects
 from stages.hardware.device import processors

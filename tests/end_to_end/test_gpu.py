@@ -8,7 +8,7 @@ import torch
 from nerf.geometry.rays import Rays, rays_of_view
 from nerf.rendering.images import render_image
 from nerf.synthetic.scenes import ring_of_cameras
-from nerf.training.metrics import mean_squared_error, psnr
+from nerf.training.psnr import mean_squared_error, psnr
 from pipeline.cli.commands import run_command
 from stages.io.field_files import load_field
 from stages.io.files import read_json

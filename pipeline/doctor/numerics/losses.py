@@ -7,7 +7,7 @@ from torch import Tensor
 
 from nerf.kernels import Backend, RayStepping, Samples
 from nerf.training.colour_loss import HUBER_DELTA, huber_loss
-from nerf.training.metrics import PSNR_LIMIT, psnr
+from nerf.training.psnr import PSNR_LIMIT, psnr
 from pipeline.doctor.numerics import Bound, Case
 from pipeline.doctor.numerics.light import N, light, packed
 from pipeline.doctor.numerics.space import decades
@@ -134,7 +134,7 @@ CASES = [
     ),
     Case(
         formula="PSNR −10 log₁₀ MSE",
-        where="nerf/training/metrics.py: psnr",
+        where="nerf/training/psnr.py: psnr",
         typical=lambda: (decades(1, -9, 0, 256, 1),),
         extreme=lambda: (torch.tensor([[0.0], [1e-38], [1e-10], [0.999], [1e30]]),),
         function=_psnrs,

@@ -11,7 +11,7 @@ from nerf.training.evaluation_pixels import (
     sample_evaluation_patches,
     sample_evaluation_pixels,
 )
-from nerf.training.metrics import PSNR_LIMIT
+from nerf.training.psnr import PSNR_LIMIT
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 
 

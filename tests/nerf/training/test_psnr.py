@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.training.metrics import PSNR_LIMIT, mean_squared_error, psnr
+from nerf.training.psnr import PSNR_LIMIT, mean_squared_error, psnr
 
 
 @given(st.floats(1e-9, 1e9), st.floats(1.01, 100))

@@ -1,4 +1,4 @@
-"""How far a picture is from the truth, as numbers that JSON can hold."""
+"""PSNR and the mean squared error behind it, as numbers that JSON can hold."""
 
 import math
 
