@@ -1,1 +1,1 @@
-"""The stages in order: what has to run, by keys and manifests, in a workspace."""
+"""The stages in order: what has to run, by cache keys and manifests, in a workspace."""

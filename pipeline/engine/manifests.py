@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from pipeline.engine.keys import digest, file_sha256
+from pipeline.engine.cache_keys import digest, file_sha256
 from stages.io.files import first_fault, write_durably
 
 NAME = "manifest.json"

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from pipeline.engine import run_file
+from pipeline.engine.cache_keys import ContentIndex, config_for_key, digest
 from pipeline.engine.display import Display
-from pipeline.engine.keys import ContentIndex, config_for_key, digest
 from pipeline.engine.stage_list import SOURCE
 from pipeline.engine.workspace import Workspace
 from stages.contract import Stage, StageConfig

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.engine import machine, manifests
+from pipeline.engine.cache_keys import digest, stage_key
 from pipeline.engine.display import Display
 from pipeline.engine.failures import StageFailed, recorded, worded
 from pipeline.engine.job import DamagedInputs, Job, NotReady
-from pipeline.engine.keys import digest, stage_key
 from pipeline.engine.manifests import BadManifest, Manifest
 from pipeline.engine.run_budget import RunBudget
 from pipeline.engine.run_digests import RunDigests

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.engine.keys import ContentIndex
+from pipeline.engine.cache_keys import ContentIndex
 from tests.drills.campaigns import Chain
 from tests.drills.drill import finished_folders, results
 

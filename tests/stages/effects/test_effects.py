@@ -9,8 +9,8 @@ import pytest
 from nerf.effects.statistics.statistic import Statistic
 from nerf.training.trainer import NonFinite
 from pipeline.engine import manifests
+from pipeline.engine.cache_keys import stage_key
 from pipeline.engine.display import SilentDisplay
-from pipeline.engine.keys import stage_key
 from stages import effects, train
 from stages.contract import run_stage
 from stages.effects import ab_runs, study

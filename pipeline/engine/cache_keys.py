@@ -1,4 +1,4 @@
-"""Content keys: what a stage's result depends on, as a hash.
+"""Cache keys: what a stage's result depends on, as a hash.
 
 key = sha256 of canonical JSON {stage, version, config, inputs: {upstream stage: its outputs digest}}. Paths in a
 config are replaced by the digest of what they point to, so that photos and workspaces can be moved. Machine,

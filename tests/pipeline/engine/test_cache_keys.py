@@ -1,4 +1,4 @@
-"""Keys: equal for equal content, different for any difference, blind to place and time."""
+"""Cache keys: equal for equal content, different for any difference, blind to place and time."""
 
 import os
 from pathlib import Path
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.engine.keys import ContentIndex, canonical_json, config_for_key, digest, stage_key
+from pipeline.engine.cache_keys import ContentIndex, canonical_json, config_for_key, digest, stage_key
 from stages.contract import StageConfig
 from tests.refusals import refused
 
