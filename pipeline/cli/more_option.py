@@ -5,7 +5,7 @@ from typing import Any
 
 from pipeline.cli.durations import seconds_from
 from pipeline.cli.options import UsageError
-from pipeline.engine.manifests import BadManifest, Manifest
+from pipeline.engine.manifest_file import BadManifest, Manifest
 from pipeline.engine.settings import Settings
 from pipeline.engine.stage_list import command_that_makes
 from pipeline.engine.workspace import Workspace

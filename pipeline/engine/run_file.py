@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from pipeline.engine import manifests
+from pipeline.engine import manifest_file
 from pipeline.schedule.budget import Account
 from stages.contract import StageError
 from stages.io.files import first_fault, write_durably
@@ -39,8 +39,8 @@ def read(root: Path) -> RunFile:
     """run.json of the workspace ``root``; an empty run for a new one. Raises StageError where it cannot be used."""
     try:
         value = json.loads((root / NAME).read_text("utf-8"))
-        if manifests.SEAL in value:  # one that a user has edited may do without
-            value = manifests.unsealed(value)
+        if manifest_file.SEAL in value:  # one that a user has edited may do without
+            value = manifest_file.unsealed(value)
         if value["version"] == VERSION:
             run = RunFile.model_validate(value, strict=True)
             run.options = _with_paths(run.options, lambda path: str(root.absolute() / path))
@@ -59,7 +59,7 @@ def read(root: Path) -> RunFile:
 def write(root: Path, run: RunFile) -> None:
     """Write run.json durably. Raises OSError."""
     value = run.model_dump(mode="json") | {"options": portable(run.options, root)}
-    text = json.dumps(manifests.sealed(value), indent=1, sort_keys=True, allow_nan=False)
+    text = json.dumps(manifest_file.sealed(value), indent=1, sort_keys=True, allow_nan=False)
     write_durably(root / NAME, (text + "\n").encode())
 
 

@@ -7,12 +7,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pipeline.engine import machine, manifests
+from pipeline.engine import machine, manifest_file
 from pipeline.engine.cache_keys import digest, stage_key
 from pipeline.engine.display import Display
 from pipeline.engine.failures import StageFailed, recorded, worded
 from pipeline.engine.job import DamagedInputs, Job, NotReady
-from pipeline.engine.manifests import BadManifest, Manifest
+from pipeline.engine.manifest_file import BadManifest, Manifest
 from pipeline.engine.run_budget import RunBudget
 from pipeline.engine.run_digests import RunDigests
 from pipeline.engine.settings import Settings
@@ -72,7 +72,7 @@ class Runner:
                     finished = None if stage in to_run else self.found(stage)
                     return finished and finished.facts
                 try:
-                    return manifests.read(self.workspace.folder(stage, key)).facts
+                    return manifest_file.read(self.workspace.folder(stage, key)).facts
                 except (FileNotFoundError, BadManifest):
                     return None
 
@@ -212,7 +212,7 @@ class Runner:
                 if needed:
                     self.workspace.finished(name, self.done[name].key, deep=True)
                 else:
-                    manifests.check_outputs(folders[name], self.done[name], deep=True)
+                    manifest_file.check_outputs(folders[name], self.done[name], deep=True)
                 self.checked.add(name)
             except BadManifest as problem:
                 damaged = damaged or needed
@@ -252,7 +252,7 @@ class Runner:
         folders = {name: self.workspace.folder(name, m.key) for name, m in (upstream | optional).items()}
         # A summary shows timings and logs too, so it depends on whole manifests and not only on outputs.
         if declared.summary:
-            inputs = {name: manifests.file_sha256(folders[name] / manifests.NAME) for name in upstream}
+            inputs = {name: manifest_file.file_sha256(folders[name] / manifest_file.NAME) for name in upstream}
         else:
             inputs = {name: m.outputs_digest for name, m in upstream.items()}
         config = self._planned(stage, inputs, folders, may_plan)
@@ -265,7 +265,7 @@ class Runner:
         if name not in self.done:
             try:
                 key = self.resolve(name, may_plan=False).key
-                self.done[name] = manifests.read(self.workspace.folder(name, key))
+                self.done[name] = manifest_file.read(self.workspace.folder(name, key))
             except (NotReady, FileNotFoundError, BadManifest):
                 if needed:
                     raise NotReady(name) from None
@@ -354,7 +354,7 @@ class Runner:
         self.running = name
         with recorded(stage, partial), counting(self.workspace.root / RUNNING), counting(partial / ATTEMPTS) as spent:
             result = stage.run(job.config, job.folders, partial, self.display)
-        outputs = manifests.describe_outputs(partial, result.outputs)
+        outputs = manifest_file.describe_outputs(partial, result.outputs)
         manifest = Manifest(
             stage=name,
             version=stage.version,
@@ -362,8 +362,8 @@ class Runner:
             config=job.config.model_dump(mode="json"),
             inputs=job.inputs,
             outputs=outputs,
-            outputs_digest=manifests.outputs_digest(outputs),
-            records=manifests.describe_outputs(partial, result.records),
+            outputs_digest=manifest_file.outputs_digest(outputs),
+            records=manifest_file.describe_outputs(partial, result.records),
             facts=result.facts,
             line=result.line,
             seconds=round(spent(), 3),

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.engine import manifests
+from pipeline.engine import manifest_file
 from pipeline.engine.failures import last_failure
 from pipeline.engine.job import Job, NotReady
-from pipeline.engine.manifests import BadManifest, Manifest
+from pipeline.engine.manifest_file import BadManifest, Manifest
 from pipeline.engine.runner import Runner
 from pipeline.engine.stage_list import STAGES, command_that_makes
 from pipeline.engine.workspace import Workspace
@@ -33,7 +33,7 @@ def last_result(workspace: Workspace, runner: Runner, stage: str) -> Manifest | 
         folders += sorted(others, key=lambda p: p.stat().st_mtime, reverse=True)
     for folder in folders:
         try:
-            return manifests.read(folder)
+            return manifest_file.read(folder)
         except (FileNotFoundError, BadManifest):
             continue
     return None
@@ -56,8 +56,8 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
         return StageStatus(stage, "stale" if last else "never", f"{error.what}: {error.why}")
     folder = workspace.folder(stage, job.key)
     try:
-        manifest = manifests.read(folder)
-        manifests.check_outputs(folder, manifest, deep)
+        manifest = manifest_file.read(folder)
+        manifest_file.check_outputs(folder, manifest, deep)
         return StageStatus(stage, "cached", manifest.line)
     except FileNotFoundError:
         pass

@@ -14,8 +14,8 @@ from threading import Lock
 
 from filelock import FileLock, Timeout
 
-from pipeline.engine import manifests, run_file
-from pipeline.engine.manifests import BadManifest, Manifest
+from pipeline.engine import manifest_file, run_file
+from pipeline.engine.manifest_file import BadManifest, Manifest
 from pipeline.engine.run_file import RunFile
 from pipeline.engine.stage_list import STAGES
 from stages.contract import KEY_LENGTH, StageError
@@ -128,10 +128,10 @@ class Workspace:
         """
         folder = self.folder(stage, key)
         try:
-            manifest = manifests.read(folder)
+            manifest = manifest_file.read(folder)
             if manifest.key != key:
                 raise BadManifest(f"{folder} belongs to another key")
-            manifests.check_outputs(folder, manifest, deep)
+            manifest_file.check_outputs(folder, manifest, deep)
         except FileNotFoundError:
             if folder.exists():
                 self._quarantine(folder)
@@ -155,8 +155,8 @@ class Workspace:
         """
         for name in (*manifest.outputs, *manifest.records):
             sync_file(partial / name)
-        manifests.write(partial, manifest)
-        self._tidy(partial, {*manifest.outputs, *manifest.records, manifests.NAME})
+        manifest_file.write(partial, manifest)
+        self._tidy(partial, {*manifest.outputs, *manifest.records, manifest_file.NAME})
         if folder.exists():  # a forced run of the same key: the old result makes way at the last moment
             self._quarantine(folder)
         partial.rename(folder)
@@ -311,8 +311,8 @@ def is_result(path: Path, root: Path) -> bool:
 def _whole(folder: Path) -> Manifest | None:
     """The manifest of a result that is whole, by its sizes; None where there is none."""
     try:
-        manifest = manifests.read(folder)
-        manifests.check_outputs(folder, manifest)
+        manifest = manifest_file.read(folder)
+        manifest_file.check_outputs(folder, manifest)
     except (FileNotFoundError, BadManifest):
         return None
     return manifest

@@ -10,8 +10,8 @@ from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any, Literal
 
-from pipeline.engine import manifests
-from pipeline.engine.manifests import BadManifest, Manifest
+from pipeline.engine import manifest_file
+from pipeline.engine.manifest_file import BadManifest, Manifest
 from pipeline.engine.workspace import Workspace
 from stages import viewer
 from stages.contract import StageError
@@ -138,7 +138,7 @@ class WorkspaceState:
         keys = self._keys()
         read = [name for name in viewer.STAGE.inputs if name in keys and name != "train"]
         folders = {name: self.workspace.folder(name, keys[name]) for name in read}
-        there = {name: folder for name, folder in folders.items() if (folder / manifests.NAME).is_file()}
+        there = {name: folder for name, folder in folders.items() if (folder / manifest_file.NAME).is_file()}
         if "normalise" not in there:
             return None
         if self.contents is None or self.of_scene != tuple(there.values()):
@@ -148,7 +148,7 @@ class WorkspaceState:
     def _finished(self, stage: str, keys: dict[str, str]) -> Manifest | None:
         """What the finished ``stage`` of these keys says of itself; None where there is none."""
         try:
-            return manifests.read(self.workspace.folder(stage, keys[stage]))
+            return manifest_file.read(self.workspace.folder(stage, keys[stage]))
         except (KeyError, FileNotFoundError, BadManifest):
             return None
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.cli import commands
-from pipeline.engine import manifests
+from pipeline.engine import manifest_file
 
 MARK = "PIPELINE_DRILL"  # in the environment of a program and of all that it starts
 TINY = (
@@ -148,9 +148,9 @@ def results(workspace: Path) -> dict[str, str]:
     """Stage → digest of its outputs, the files read anew. The report shows how long everything took: it is left out."""
     found = {}
     for stage, folder in finished_folders(workspace).items():
-        manifest = manifests.read(folder)
-        assert manifest.outputs_digest == manifests.outputs_digest(
-            manifests.describe_outputs(folder, tuple(manifest.outputs))
+        manifest = manifest_file.read(folder)
+        assert manifest.outputs_digest == manifest_file.outputs_digest(
+            manifest_file.describe_outputs(folder, tuple(manifest.outputs))
         ), f"{folder} is not what its manifest says"
         if stage != "report":
             found[stage] = manifest.outputs_digest

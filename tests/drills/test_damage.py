@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.engine import manifests
-from pipeline.engine.manifests import BadManifest
+from pipeline.engine import manifest_file
+from pipeline.engine.manifest_file import BadManifest
 from pipeline.engine.stage_list import usual
 from tests.drills.campaigns import Chain
 from tests.drills.drill import Program, copy_workspace, finished_folders, results
@@ -48,7 +48,7 @@ def test_a_flipped_bit_in_any_file_is_found(chain: Chain, tmp_path: Path):
             sound = file.read_bytes()
             flip(file)
             with pytest.raises((BadManifest, UnicodeDecodeError), match=r"changed|cannot be used|decode"):
-                manifests.check_outputs(folder, manifests.read(folder), deep=True)
+                manifest_file.check_outputs(folder, manifest_file.read(folder), deep=True)
             file.write_bytes(sound)
             count += 1
     assert count > 45

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from benchmarks.cluster import killing
 from pipeline.cli.commands import run_command
-from pipeline.engine import manifests
+from pipeline.engine import manifest_file
 from pipeline.engine.workspace import Workspace
 from tests.synthetic_photos import SyntheticPhotos
 
@@ -16,7 +16,7 @@ def made(photos: Path, workspace: Path, *words: str) -> dict[str, str]:
     """The digest of every stage's outputs after a run."""
     assert run_command(["run", str(photos), "-o", str(workspace), *SMALL, *words]) == 0
     keys = Workspace(workspace).read_run().keys
-    return {name: manifests.read(workspace / name / keys[name][:16]).outputs_digest for name in STAGES}
+    return {name: manifest_file.read(workspace / name / keys[name][:16]).outputs_digest for name in STAGES}
 
 
 def test_killed_processes_change_no_digest(ray_cluster: str, synthetic_photos: SyntheticPhotos, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from hypothesis import strategies as st
 
 from pipeline.cli.options import UsageError
-from pipeline.engine.manifests import BadManifest
+from pipeline.engine.manifest_file import BadManifest
 from stages.contract import StageError
 from stages.ingest.decoding import DecodeError
 from tests.fuzz import cameras, pictures, workspaces

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from pipeline.cli.commands import run_command
-from pipeline.engine.manifests import BadManifest, Manifest, check_outputs, outputs_digest, read, sealed
+from pipeline.engine.manifest_file import BadManifest, Manifest, check_outputs, outputs_digest, read, sealed
 from pipeline.engine.run_file import VERSION
 from pipeline.engine.workspace import Workspace
 from stages.ingest.sources import find_source

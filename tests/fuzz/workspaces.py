@@ -17,8 +17,8 @@ from safetensors.numpy import save
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from pipeline.cli.commands import _reader
 from pipeline.cli.options import read_toml, settings_from
-from pipeline.engine import manifests, status
-from pipeline.engine.manifests import Manifest, outputs_digest, sealed
+from pipeline.engine import manifest_file, status
+from pipeline.engine.manifest_file import Manifest, outputs_digest, sealed
 from pipeline.engine.run_file import VERSION
 from pipeline.engine.settings import Settings
 from stages.contract import StageError
@@ -84,7 +84,7 @@ def with_seal(text: bytes) -> bytes:
 
 
 def try_manifest(folder: Path) -> None:
-    manifests.check_outputs(folder, manifests.read(folder), deep=True)
+    manifest_file.check_outputs(folder, manifest_file.read(folder), deep=True)
 
 
 def try_photos(folder: Path) -> None:

@@ -16,7 +16,7 @@ from PIL import Image
 
 from pipeline.cli.commands import run_command
 from pipeline.engine.failures import StageFailed, recorded
-from pipeline.engine.manifests import Manifest, describe_outputs, outputs_digest
+from pipeline.engine.manifest_file import Manifest, describe_outputs, outputs_digest
 from pipeline.engine.run_file import RunFile
 from pipeline.engine.stage_list import STAGES
 from pipeline.engine.status import status_of

@@ -10,8 +10,8 @@ from typing import Any
 import psutil
 
 from nerf.training.trainer import StepResult
-from pipeline.engine import manifests
-from pipeline.engine.manifests import Manifest
+from pipeline.engine import manifest_file
+from pipeline.engine.manifest_file import Manifest
 from pipeline.engine.run_file import RunFile, write
 from pipeline.engine.workspace import Workspace
 from stages import train
@@ -33,8 +33,8 @@ PAUSE_SECONDS = 0.02  # between steps: it leaves the cores to who looks on, a br
 
 def manifest_of(stage: str, folder: Path, result: StageResult, inputs: dict[str, str] | None = None) -> Manifest:
     """Of ``result`` in ``folder``, made of ``inputs``: the digest of each stage's outputs."""
-    outputs, records = (manifests.describe_outputs(folder, names) for names in (result.outputs, result.records))
-    digest = manifests.outputs_digest(outputs)
+    outputs, records = (manifest_file.describe_outputs(folder, names) for names in (result.outputs, result.records))
+    digest = manifest_file.outputs_digest(outputs)
     return Manifest(stage, 1, KEYS[stage], {}, inputs or {}, outputs, digest, records, result.facts, "", 1.0, "")
 
 
@@ -55,7 +55,7 @@ class RunningTraining:
         for name, finished in self.inputs.items():
             finished.parent.mkdir(parents=True)
             made[name].rename(finished) if name in made else finished.mkdir()
-            manifests.write(finished, manifest_of(name, finished, StageResult((), "")))
+            manifest_file.write(finished, manifest_of(name, finished, StageResult((), "")))
         write_json(self.inputs["normalise"] / "scene.json", content)
         write_json(self.inputs["scale"] / "scale.json", {"metres_per_unit": None})
         write(self.root, RunFile(keys=KEYS))
@@ -95,7 +95,7 @@ class RunningTraining:
 
     def _finish(self, stage: str, partial: Path, result: StageResult, of: str) -> None:
         """As the runner does, of the outputs of one other stage."""
-        inputs = {of: manifests.read(self.workspace.folder(of, KEYS[of])).outputs_digest}
+        inputs = {of: manifest_file.read(self.workspace.folder(of, KEYS[of])).outputs_digest}
         finished = self.workspace.folder(stage, KEYS[stage])
         self.workspace.finish(partial, finished, manifest_of(stage, partial, result, inputs))
 

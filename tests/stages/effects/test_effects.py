@@ -8,7 +8,7 @@ import pytest
 
 from nerf.effects.statistics.statistic import Statistic
 from nerf.training.trainer import NonFinite
-from pipeline.engine import manifests
+from pipeline.engine import manifest_file
 from pipeline.engine.cache_keys import stage_key
 from pipeline.engine.display import SilentDisplay
 from stages import effects, train
@@ -165,8 +165,8 @@ def test_what_was_asked_for_is_done(decided: Callable, value: effects.Switch) ->
 
 def training_key(effects_folder: Path) -> str:
     """The key of a training that rests on these decisions."""
-    outputs = manifests.describe_outputs(effects_folder, ("decisions.json",))
-    return stage_key("train", train.STAGE.version, {}, {"effects": manifests.outputs_digest(outputs)})
+    outputs = manifest_file.describe_outputs(effects_folder, ("decisions.json",))
+    return stage_key("train", train.STAGE.version, {}, {"effects": manifest_file.outputs_digest(outputs)})
 
 
 @pytest.mark.parametrize("said", [False, None])
