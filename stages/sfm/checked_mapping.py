@@ -15,7 +15,6 @@ from stages.sfm.colmap.database.calibration import MAX_EXIF_RATIO, Told, far_apa
 from stages.sfm.colmap.database.images import adopt_cameras
 from stages.sfm.colmap.database.matching import best_linked
 from stages.sfm.colmap.database.thinning import thin_matches
-from stages.sfm.colmap.diagnosis import compare_models, disagree
 from stages.sfm.colmap.joining import Piece, join_pieces
 from stages.sfm.colmap.mappers import incremental_options, map_globally, map_incrementally
 from stages.sfm.colmap.model_check import (
@@ -28,6 +27,7 @@ from stages.sfm.colmap.model_check import (
     supported_runs,
     supported_steps,
 )
+from stages.sfm.colmap.model_comparison import compare_models, disagree
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import copy_consistent_matches, deregister, drop_outside_main_segment, register_again
 from stages.sfm.extraction_and_matching import capture_sequence, consecutive_pairs

@@ -133,8 +133,8 @@ def image_rows(
     left_out: Mapping[str, Note],
 ) -> list[dict[str, Any]]:
     """What became of each photo, for registration.json. ``models`` are the names in each sub-model, best first;
-    ``supports`` and ``conflict`` as stages/sfm/colmap/diagnosis.py finds them; ``left_out`` says why a camera cannot be
-    used, by name."""
+    ``supports`` as colmap/unregistered_images.py finds them, ``conflict`` as colmap/model_comparison.py; ``left_out``
+    says why a camera cannot be used, by name."""
     contradicted = set(models[conflict["group"]]) if conflict else set()
     entries = []
     for index, name in enumerate(names):

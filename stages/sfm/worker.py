@@ -20,10 +20,11 @@ from stages.io.files import make_durable
 from stages.sfm.checked_mapping import register_missing, run_mapping
 from stages.sfm.colmap.adjustment.final_bundle_adjustment import final_bundle_adjustment
 from stages.sfm.colmap.database.matching import matched_pairs
-from stages.sfm.colmap.diagnosis import find_conflict, links, supports
 from stages.sfm.colmap.model_check import check_model, facts, reasons
+from stages.sfm.colmap.model_comparison import find_conflict
 from stages.sfm.colmap.models import load_native, turned_upright, write_native
 from stages.sfm.colmap.repair import deregister
+from stages.sfm.colmap.unregistered_images import links, supports
 from stages.sfm.extraction_and_matching import capture_sequence, match_photos, relaxed_pairs
 from stages.sfm.job import Job, JobState, Send, end_with_parent
 from stages.sfm.retry_strategies import (

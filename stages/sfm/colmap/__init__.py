@@ -1,8 +1,9 @@
 """Everything that is done with COLMAP: the only package that imports pycolmap.
 
 ``database``: features and matches. ``mappers``: models of them. ``model_check``: whether a model agrees with its
-matches; ``repair`` and ``joining`` make a better one where it does not. ``diagnosis``: what a model lacks, and why.
-``adjustment``: cameras, poses and points adjusted. ``models``: models on disk. ``cameras``: pixels to rays and back.
+matches; ``repair`` and ``joining`` make a better one where it does not. ``model_comparison``: in which images two
+models differ. ``unregistered_images``: what a model lacks, and why. ``adjustment``: cameras, poses and points adjusted.
+``models``: models on disk. ``cameras``: pixels to rays and back.
 
 COLMAP is native code that can abort, so it runs in worker processes (stages/sfm/worker.py and others). Safe to call
 anywhere are cameras.py and, in models.py, what reads and writes a SparseModel. *Native* is COLMAP's own object or file,

@@ -18,10 +18,10 @@ from stages.sfm.colmap.database.calibration import Told, set_focal_length
 from stages.sfm.colmap.database.copies import copy_without_pairs
 from stages.sfm.colmap.database.images import fill_database
 from stages.sfm.colmap.database.matching import best_linked, match_pairs
-from stages.sfm.colmap.diagnosis import compare_models
 from stages.sfm.colmap.model_check import (
     supported_runs,
 )
+from stages.sfm.colmap.model_comparison import compare_models
 from stages.sfm.colmap.repair import (
     restricted,
 )

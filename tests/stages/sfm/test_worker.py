@@ -8,7 +8,7 @@ import pytest
 
 from stages.contract import Note
 from stages.sfm import worker
-from stages.sfm.colmap.diagnosis import Links
+from stages.sfm.colmap.unregistered_images import Links
 from stages.sfm.retry_strategies import STRATEGIES, Outcome, StrategyLog
 
 

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from nerf.geometry.alignment import fit_poses
 from nerf.geometry.scene import Similarity
-from stages.sfm.colmap.diagnosis import compare_models
 from stages.sfm.colmap.joining import MIN_SHARED, Piece, join, join_pieces
+from stages.sfm.colmap.model_comparison import compare_models
 
 PHOTOS, FOCAL_PX, NOISE_PX = 24, 400.0, 0.3
 STEP, DOOR = 0.2, 1.5  # between photos, along a wall that is 1.3 to 1.8 away; between doors that look alike

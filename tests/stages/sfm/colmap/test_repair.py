@@ -4,12 +4,12 @@ from types import SimpleNamespace
 from typing import Any
 
 from stages.io.photos import Photo
-from stages.sfm.colmap.diagnosis import compare_models
 from stages.sfm.colmap.mappers import incremental_options
 from stages.sfm.colmap.model_check import (
     check_model,
     reasons,
 )
+from stages.sfm.colmap.model_comparison import compare_models
 from stages.sfm.colmap.repair import (
     copy_consistent_matches,
     deregister,

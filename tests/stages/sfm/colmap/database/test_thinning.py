@@ -6,11 +6,11 @@ import pycolmap
 
 from stages.sfm.colmap.database.correspondences import Correspondences
 from stages.sfm.colmap.database.thinning import best_tracks, thin_matches
-from stages.sfm.colmap.diagnosis import compare_models
 from stages.sfm.colmap.mappers import incremental_options, map_incrementally
 from stages.sfm.colmap.model_check import (
     check_model,
 )
+from stages.sfm.colmap.model_comparison import compare_models
 from stages.sfm.retry_strategies import MappingOptions
 from tests.stages.sfm.colmap.made_models import PHOTOS, make
 

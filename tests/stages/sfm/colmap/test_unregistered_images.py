@@ -4,10 +4,9 @@ import numpy as np
 import pycolmap
 
 from stages.sfm.colmap.database.matching import match_pairs
-from stages.sfm.colmap.diagnosis import compare_models, links
+from stages.sfm.colmap.unregistered_images import links
 from stages.sfm.pairs.pair_selection import exhaustive
 from tests.stages.sfm.colmap.conftest import COUNT
-from tests.stages.sfm.colmap.made_models import PHOTOS, Made, turn
 
 
 def test_unregistered_photos_are_joined_by_their_matches(database: Path) -> None:
@@ -28,13 +27,3 @@ def test_few_matches_with_each_of_several_photos_join_as_well(database: Path) ->
             few = pycolmap.TwoViewGeometry(inlier_matches=np.tile(np.arange(20, dtype=np.uint32)[:, None], 2), config=2)
             db.write_two_view_geometry(photo, COUNT, few)
         assert links(database, placed).join == expected
-
-
-def test_models_that_disagree_name_images_with_different_poses(made: Made) -> None:
-    other = pycolmap.Reconstruction(made.model)
-    for image_id in (3, 9):
-        turn(other, image_id, degrees=40.0)
-    names = [made.model.image(i).name for i in (3, 9)]
-    compared = compare_models(made.model, other)
-    assert (compared["photos"], compared["agree"]) == (PHOTOS, PHOTOS - 2)
-    assert sorted(compared["different"]) == sorted(names)
