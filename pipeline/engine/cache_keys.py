@@ -15,7 +15,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from stages.contract import StageError
-from stages.ingest.sources import camera_files, cannot_read
+from stages.ingest.sources import cannot_read
+from stages.ingest.sources.camera_files import camera_files
 
 
 def canonical_json(value: Any) -> bytes:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.contract import Note, StageError
-from stages.ingest.sources import own_registration
+from stages.ingest.sources.camera_files import own_registration
 from stages.io.amounts import counted
 from stages.io.photos import Photo
 from stages.io.sparse_model import SparseModel

@@ -9,7 +9,7 @@ turned upright as ingest turned the photos.
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from stages.ingest.sources import LLFF
+from stages.ingest.sources.camera_files import LLFF
 from stages.io.photos import Photo
 from stages.io.transforms_files import TRAIN
 from stages.sfm.imported.colmap_model import read_colmap_model

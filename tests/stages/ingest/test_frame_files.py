@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from stages.contract import StageError
-from stages.ingest.frame_files import FrameFiles
 from stages.ingest.sources import find_source, unused_masks
+from stages.ingest.sources.frame_files import FrameFiles
 from tests.refusals import refused
 from tests.stages.ingest.test_sources import names, refusal, touch, transforms
 

@@ -14,7 +14,6 @@ from stages.contract import StageError
 from stages.ingest.auxiliary_files import pair_masks
 from stages.ingest.sources import (
     Source,
-    camera_files,
     find_source,
     is_gone,
     mask_beside,
@@ -23,6 +22,7 @@ from stages.ingest.sources import (
     unused_cameras,
     unused_masks,
 )
+from stages.ingest.sources.camera_files import camera_files
 from tests.refusals import refused
 
 
