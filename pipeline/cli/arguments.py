@@ -1,11 +1,12 @@
 """The words of the command line: one dataclass per command, read by tyro; dotted flags come from the stage configs."""
 
+import difflib
 import io
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import redirect_stderr, suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import redirect_stderr
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, TypeVar, Union, get_args
@@ -230,6 +231,7 @@ COMMANDS: dict[str, type] = {
 
 
 TYPES = tyro.constructors.ConstructorRegistry()
+FLAG = re.compile("--[a-zA-Z].*|-[a-zA-Z]")  # to tyro no word like that is a value
 
 
 @TYPES.primitive_rule
@@ -265,21 +267,102 @@ def parse(kind: type[T], command: str, words: Sequence[str]) -> T:
 
     Raises UsageError with every wrong word in a sentence of its own, SystemExit(0) after ``--help``.
     """
-    positional = {
-        name: tyro.MISSING for name in ("photos", "scenes", "workspace", "stage") if name in kind.__annotations__
-    }
-    default: Any = kind(**positional)
+    default: Any = kind(**dict.fromkeys(_positional(kind), tyro.MISSING))
     _check_none_is_empty(command, words)
     said = io.StringIO()
     try:
         with redirect_stderr(said):
-            return tyro.cli(kind, prog=f"pipeline {command}", args=list(words), default=default, registry=TYPES)
+            parsed, unknown = tyro.cli(
+                kind,
+                prog=f"pipeline {command}",
+                args=list(words),
+                default=default,
+                registry=TYPES,
+                return_unknown_args=True,
+            )
     except SystemExit as ending:
         if ending.code in (None, 0):
             raise
-        if "photos" in positional and (surplus := _surplus_file(kind, words, default)):
-            raise UsageError(f"{surplus} is one file too many; give the folder that holds the photos") from ending
-        raise UsageError(f"{_what_is_wrong(ending, said.getvalue())} (pipeline {command} --help)") from ending
+        wrong = _what_is_wrong(ending, said.getvalue())
+        if wrong.startswith("Missing from"):
+            wrong = f"too few words: {_usage(kind, command)}"
+        raise UsageError(_unknown_option(kind, command, words) or f"{wrong} (pipeline {command} --help)") from ending
+    if unknown:
+        raise UsageError(_unknown_option(kind, command, words) or _surplus_word(kind, unknown[0]))
+    return parsed
+
+
+def _positional(kind: type) -> list[str]:
+    """The words of a command that stand without a flag."""
+    return [name for name in ("stage", "photos", "scenes", "workspace") if name in kind.__annotations__]
+
+
+def _usage(kind: type, command: str, given: Mapping[str, str] | None = None) -> str:
+    """``pipeline explain STAGE WORKSPACE``: a command with its words, where they are not ``given``."""
+    words = ((given or {}).get(name, name.upper()) for name in _positional(kind))
+    return " ".join(["pipeline", command, *words])
+
+
+def _unknown_option(kind: type, command: str, words: Sequence[str]) -> str | None:
+    """The first option in ``words`` that the command does not have, and what may be meant; None where it has all."""
+    known = _flags(kind)
+    for flag in (word.partition("=")[0] for word in takewhile(lambda word: word != "--", words)):
+        if FLAG.fullmatch(flag) and flag.replace("_", "-") not in known:
+            meant = _what_is_meant(kind, command, flag, words)
+            return f"pipeline {command} has no option {flag}{meant} (pipeline {command} --help)"
+    return None
+
+
+def _what_is_meant(kind: type, command: str, flag: str, words: Sequence[str]) -> str:
+    """What an option may mean that the command does not have: a word without a flag, another command, or an option
+    that is spelt nearly like it."""
+    name = "workspace" if flag in ("-o", "--output") else flag.removeprefix("--")
+    if name in _positional(kind):
+        value = _given(words, flag) or "-"
+        value = name.upper() if value.startswith("-") else value
+        return f"; give the {name} without it: {_usage(kind, command, {name: value})}"
+    others = [other for other, its in {**COMMANDS, "STAGE": StageArguments}.items() if flag in _flags(its)]
+    if others:
+        return f"; it belongs to {', '.join(f'`pipeline {other}`' for other in others)}"
+    own = sorted(_flags(kind))
+    near = [one for one in own if one.endswith(f".{name}")] or difflib.get_close_matches(flag, own, cutoff=0.8)
+    return f"; perhaps {', '.join(near)}" if near else ""
+
+
+def _surplus_word(kind: type, word: str) -> str:
+    if "photos" in _positional(kind) and Path(word).is_file():  # as a shell gives them for *.jpg
+        return f"{word} is one file too many; give the folder that holds the photos"
+    return f"{word} is one word too many"
+
+
+def _flags(kind: type) -> set[str]:
+    """Every spelling of every option of a command."""
+    found = {"-h", "--help"}
+    for name, annotation in kind.__annotations__.items():
+        given, *metadata = get_args(annotation) if hasattr(annotation, "__metadata__") else (annotation,)
+        if given is Settings:
+            found |= {flag for stage in STAGES for flags in _flags_of(stage).values() for flag in flags}
+        elif given is Common:
+            found |= _flags(Common)
+        elif name not in _positional(kind):
+            found |= _spellings(name, given, metadata)
+    return found
+
+
+def _flags_of(stage: str) -> dict[str, set[str]]:
+    """Every spelling of each option of a stage, by its dotted name."""
+    return {
+        name: _spellings(f"{stage}.{name}", option.annotation, option.metadata)
+        for name, option in STAGES[stage].config.flags()
+    }
+
+
+def _spellings(name: str, kind: Any, metadata: Iterable[Any]) -> set[str]:
+    """An option's flags: its own, what turns a switch off, and its other names."""
+    *parents, last = next((entry.name for entry in metadata if getattr(entry, "name", None)), name).split(".")
+    ends = (last, f"no-{last}") if kind is bool else (last,)
+    aliases = {alias for entry in metadata for alias in getattr(entry, "aliases", None) or ()}
+    return aliases | {"--" + ".".join([*parents, end]).replace("_", "-") for end in ends}
 
 
 def _check_none_is_empty(command: str, words: Sequence[str]) -> None:
@@ -312,20 +395,8 @@ def with_flags(settings: Settings, parsed: Settings, command: str, words: Sequen
 
 def _named_options(stage: str, words: Sequence[str]) -> Iterator[str]:
     """The dotted names of the stage's options that ``words`` give, which may be spelt with underscores."""
-    flags = {word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")}
-    for name, option in STAGES[stage].config.flags():
-        *parents, last = f"{stage}.{name}".replace("_", "-").split(".")
-        own = [".".join([*parents, last]), ".".join([*parents, f"no-{last}"])]
-        aliases = [alias for entry in option.metadata for alias in getattr(entry, "aliases", None) or ()]
-        if not flags.isdisjoint([*(f"--{flag}" for flag in own), *aliases]):
-            yield name
-
-
-def _surplus_file(kind: type, words: Sequence[str], default: Any) -> str | None:
-    """The first word that is none of the options but an existing file, as a shell gives them for ``*.jpg``."""
-    with suppress(SystemExit), redirect_stderr(io.StringIO()):
-        _, unknown = tyro.cli(kind, args=list(words), default=default, return_unknown_args=True, registry=TYPES)
-        return next((word for word in unknown if Path(word).is_file()), None)
+    given = {word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")}
+    return (name for name, flags in _flags_of(stage).items() if not flags.isdisjoint(given))
 
 
 def _without_replaced(recorded: TrainConfig, words: Sequence[str]) -> TrainConfig:
@@ -361,12 +432,10 @@ def _what_is_wrong(ending: SystemExit, box: str) -> str:
     words = " ".join(line for line in lines if line.strip("─-"))
     for end in ("Got errors:", "Argument helptext:", "For full helptext"):
         words = words.split(end)[0]
-    words, _, similar = words.partition("Perhaps you meant:")
     words = re.sub(r"invalid literal for int\(\) with base 10: ('.*')", r"\1 is not a whole number", words)
     words = re.sub(r"Could not find valid parse for arguments: \[(.*)\]", r"\1 cannot be read", words)
     words = re.sub(r"could not convert string to float: ('.*')", r"\1 is not a number", words)
-    words = " ".join(words.split()).removeprefix("Error parsing ").rstrip(".")
-    return words + (f"; perhaps {', '.join(re.findall(r'--[a-z0-9.-]+', similar))}" if similar else "")
+    return " ".join(words.split()).removeprefix("Error parsing ").rstrip(".")
 
 
 def _gives(words: Sequence[str], *options: str) -> bool:

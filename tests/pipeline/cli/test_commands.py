@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from pipeline.cli.arguments import COMMANDS, StageArguments, _flags
 from pipeline.cli.commands import run_command
 from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import default_workspace
@@ -68,7 +70,6 @@ def test_help_of_run_lists_the_stage_options(capsys: pytest.CaptureFixture[str])
         (["--more", "9m", "--config", "a.toml"], "--more uses the recorded options, not those of --config a.toml"),
         (["-o", ""], "nothing is given after -o"),
         (["--output="], "nothing is given after --output="),
-        (["--train.stepz", "5"], "Unrecognized options: --train.stepz, 5; perhaps --train.steps"),
     ],
 )  # fmt: skip
 def test_usage_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str):
@@ -76,6 +77,44 @@ def test_usage_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str], words:
     text = capsys.readouterr().err
     assert text.startswith("pipeline: ") and message in text
     assert text.count("\n") == 1 and "pydantic" not in text
+
+
+@pytest.mark.parametrize(
+    ("words", "unknown", "meant"),
+    [
+        (["train", "--workspace", "w.nerf"], "--workspace", "pipeline train w.nerf"),
+        (["train", "--workspace=w.nerf", "--train.steps", "5"], "--workspace", "pipeline train w.nerf"),
+        (["status", "-o", "w.nerf"], "-o", "pipeline status w.nerf"),
+        (["clean", "--output"], "--output", "pipeline clean WORKSPACE"),
+        (["explain", "train", "--workspace", "w.nerf"], "--workspace", "pipeline explain STAGE w.nerf"),
+        (["run", "--photos", "set"], "--photos", "pipeline run set"),
+        (["resume", "w.nerf", "--budget", "5m"], "--budget", "`pipeline run`"),
+        (["mesh", "w.nerf", "--until", "mesh"], "--until", "`pipeline run`"),
+        (["status", "w.nerf", "--force"], "--force", "`pipeline STAGE`"),
+        (["run", "set", "--train.stepz", "5"], "--train.stepz", "--train.steps"),
+        (["run", "set", "--train.stepz", "5", "--train.seconds", "0"], "--train.stepz", "--train.steps"),
+        (["run", "set", "--steps", "5"], "--steps", "--train.steps"),
+        (["run", "set", "--train.no-steps"], "--train.no-steps", "--train.steps"),
+        (["status", "--wrong"], "--wrong", ""),
+        (["status", "w.nerf", "w2.nerf"], "w2.nerf", ""),
+        (["explain"], "", "pipeline explain STAGE WORKSPACE"),
+    ],
+)
+def test_words_that_a_command_lacks_are_named(
+    capsys: pytest.CaptureFixture[str], words: list[str], unknown: str, meant: str
+):
+    assert run_command(words) == 2
+    said = capsys.readouterr().err
+    assert f" {unknown}" in said and meant in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, "train"])
+def test_every_option_in_the_help_is_known(command: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        run_command([command, "--help"])
+    rows = re.findall(r"(?m)^[│ ]+(-.*)$", capsys.readouterr().out)
+    shown = {flag for row in rows for flag in re.findall(r"(?<!\S)--?[a-z][\w.-]*", row)}
+    assert shown == _flags(COMMANDS.get(command, StageArguments))
 
 
 @pytest.mark.parametrize(
