@@ -70,6 +70,7 @@ MACHINE = ("time", "cores", "processors", "compute_device", "available_bytes", "
 PATCHING = ("setattr", "setitem", "delattr")
 NO_SUBJECT = ("utils.py", "util.py", "helpers.py", "misc.py", "common.py")
 BACKENDS = ("torch", "warp")
+PLURAL_ENDINGS = ("s", "es", "ies")
 BANNED_CALLS = ("cumprod", "torch.load", "eval")
 BANNED_TEXT = ("nan_to_num", "pickle.load", "except Exception: pass", "except:")
 
@@ -302,6 +303,15 @@ def hidden_zeros(module: Module) -> Iterator[str]:
                     yield ast.unparse(node)
 
 
+def hand_made_plurals(module: Module) -> Iterator[str]:
+    """Endings by a count, which :func:`stages.io.amounts.counted` knows."""
+    for node in ast.walk(module.tree):
+        parts = (node.body, node.orelse) if isinstance(node, ast.IfExp) else ()
+        parts = (node.left,) if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult) else parts
+        if any(isinstance(part, ast.Constant) and part.value in PLURAL_ENDINGS for part in parts):
+            yield ast.unparse(node)
+
+
 def calls_of_plan(module: Module) -> Iterator[str]:
     """Calls of a stage's plan() beside :func:`stages.contract.plan_stage`."""
     for name in calls(module.tree):
@@ -451,6 +461,10 @@ def test_no_division_hides_a_zero():
     assert offenders(hidden_zeros, OURS) == []
 
 
+def test_messages_count_in_one_way():
+    assert offenders(hand_made_plurals, [module for module in OURS if module not in NERF]) == []
+
+
 MANY = ", ".join("abcdefghi")
 BROKEN: dict[Rule, list[tuple[str, str]]] = {
     imports_against_the_current: [("nerf/a.py", "def f():\n    import stages.io"), ("stages/a.py", "import pipeline")],
@@ -491,6 +505,11 @@ BROKEN: dict[Rule, list[tuple[str, str]]] = {
         ("a.py", "try: a()\nexcept Exception:\n    pass"),
         ("a.py", "try: a()\nexcept BaseException:\n    pass"),
         ("a.py", "with contextlib.suppress(Exception): a()"),
+    ],
+    hand_made_plurals: [
+        ("a.py", "f\"{n} photo{'' if n == 1 else 's'}\""),
+        ("a.py", "f\"{n} photo{'s' * (n != 1)}\""),
+        ("a.py", "f\"{n} strateg{'y' if n == 1 else 'ies'}\""),
     ],
     hidden_zeros: [("a.py", "x / (y + 1e-8)"), ("a.py", "x / (1e-8 + y)")],
 }

@@ -62,6 +62,16 @@ def assigned(tree: ast.AST, own: bool = False) -> dict[str, list[ast.expr]]:
     return found
 
 
+def filled_in(value: ast.expr) -> str:
+    """What the program fills in, in braces; what it counts as its number and what several of it are called."""
+    if isinstance(value, ast.Call) and ast.unparse(value.func) == "counted":
+        count, *names = value.args
+        if all(isinstance(name, ast.Constant) for name in names):
+            one, *many = [str(ast.literal_eval(name)) for name in names] or ["photo"]
+            return f"{{{ast.unparse(count)}}} {many[0] if many else f'{one}s'}"
+    return "{" + ast.unparse(value) + "}"
+
+
 def sentences(expression: ast.expr, names: dict[str, list[ast.expr]], depth: int = 3) -> list[str]:
     """The texts that an expression may have, values in braces."""
     if isinstance(expression, ast.Constant):
@@ -74,12 +84,12 @@ def sentences(expression: ast.expr, names: dict[str, list[ast.expr]], depth: int
         return [text for value in names[expression.id] for text in sentences(value, names, depth - 1)]
     if isinstance(expression, ast.JoinedStr):
         parts = [
-            part.value if isinstance(part, ast.Constant) else "{" + ast.unparse(part.value) + "}"
+            part.value if isinstance(part, ast.Constant) else filled_in(part.value)
             for part in expression.values
             if isinstance(part, ast.Constant | ast.FormattedValue)
         ]
         return ["".join(map(str, parts))]
-    return ["{" + ast.unparse(expression) + "}"]
+    return [filled_in(expression)]
 
 
 @cache

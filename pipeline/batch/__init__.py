@@ -21,7 +21,7 @@ from pipeline.batch.scenes import Scene, printable
 from pipeline.engine.display import Display
 from stages.contract import StageError
 from stages.hardware import cluster
-from stages.io.amounts import duration
+from stages.io.amounts import counted, duration
 
 MIN_SECONDS = 1.0  # of the budget, for a scene to be begun
 
@@ -78,7 +78,7 @@ def _cannot_write(batch: Batch, error: OSError) -> StageError:
 def _run_all(batch: Batch, display: Display) -> int:
     state = _continued(batch, batch_file.read(batch.folder))
     limit = "" if batch.budget is None else f" · {duration(batch.budget)} for all"
-    words = [f"{len(state.scenes)} scenes", f"results in {batch.folder}{limit}", *cluster.described()]
+    words = [counted(len(state.scenes), "scene"), f"results in {batch.folder}{limit}", *cluster.described()]
     display.headline(" · ".join(words))
     here = partial(_run_here, batch, state, display)
     for ending in cluster.fan_out(run_scene, _begun(batch, state, display), here, "machine"):

@@ -8,7 +8,7 @@ from typing import Any
 from PIL import Image
 
 from pipeline.batch.batch_file import BatchFile, SceneState
-from stages.io.amounts import duration
+from stages.io.amounts import counted, duration
 from stages.io.files import write_durably
 from stages.report.html import jpeg_uri, templates
 
@@ -20,7 +20,7 @@ LINKED = {"viewer.html": "viewer", "report.html": "report", "mesh.glb": "mesh", 
 def write_page(folder: Path, batch: BatchFile) -> None:
     """Write the page of the batch in ``folder``, whose workspaces lie beside it. Raises OSError."""
     environment = templates(Path(__file__).parent)
-    environment.filters["duration"] = duration
+    environment.filters |= {"counted": counted, "duration": duration}
     scenes = list(batch.scenes.items())
     done = [(name, scene) for name, scene in scenes if scene.state == "done"]
     page = environment.get_template("batch.html.j2").render(

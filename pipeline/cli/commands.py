@@ -39,7 +39,7 @@ from pipeline.view import check_installed, open_browser, serve_during
 from stages.contract import StageError
 from stages.hardware import cluster
 from stages.hardware.ranks import launched
-from stages.io.amounts import duration
+from stages.io.amounts import counted, duration
 
 MAX_PORT = 65535
 REPORT_IT = "Finished stages are kept. Please report it with the output of the same command and --debug."
@@ -452,7 +452,7 @@ def command_clean(words: Sequence[str]) -> int:
             print(f"{'would remove' if given.dry_run else 'removed'} {folder}")
             if not given.dry_run:
                 shutil.rmtree(folder)
-    print(f"{freed / 2**20:.1f} MB in {len(stale)} folders")
+    print(f"{freed / 2**20:.1f} MB in {counted(len(stale), 'folder')}")
     return 0
 
 

@@ -11,7 +11,7 @@ from nerf.runtime.profiler import WorkCounts
 from nerf.training.hash_grid_trainer import ADAM_BYTES
 from stages.effects.decisions import Space
 from stages.hardware.device import compute_device, cores
-from stages.io.amounts import bytes_in_words, short_count
+from stages.io.amounts import bytes_in_words, counted, short_count
 from stages.train.config import Config
 from stages.train.fields.hash_grid import SAMPLES_PER_RAY, field_settings, rays_per_step, timed, with_defaults
 
@@ -32,7 +32,7 @@ def bench_lines(device: torch.device) -> list[str]:
     products = {width: measure_matmul(device, width, SECONDS) for width in (64, 256)}
     reads = {name: measure_gather(device, rows, SECONDS) for name, rows in TABLES.items()}
     copied = measure_copy(device, SECONDS)
-    words = f"{count} cores at once" if device.type == "cpu" else "the GPU"
+    words = f"{counted(count, 'core')} at once" if device.type == "cpu" else "the GPU"
     lines = [f"rates of {words}, float32" + (", per core and in all" if count > 1 else "")]
     for width, rate in products.items():
         lines.append(_line(f"matrix multiplication (8192, {width}) × ({width}, {width})", rate / 1e9, count, "GFLOP/s"))

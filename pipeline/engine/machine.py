@@ -9,6 +9,7 @@ from typing import Any
 import psutil
 
 from stages.hardware.device import processors
+from stages.io.amounts import counted
 
 
 def gpu_name() -> str | None:
@@ -56,5 +57,5 @@ def facts() -> dict[str, Any]:
 
 def headline(workspace: Path) -> str:
     """One line for the start of a run."""
-    gpu = gpu_name() or "no GPU"
-    return f"{processors()} cores, {gpu}, {free_bytes(workspace) / 2**30:.0f} GB free · workspace {workspace}"
+    machine = f"{counted(processors(), 'core')}, {gpu_name() or 'no GPU'}"
+    return f"{machine}, {free_bytes(workspace) / 2**30:.0f} GB free · workspace {workspace}"

@@ -23,7 +23,7 @@ from stages.depth.rectification import Rectified
 from stages.depth.stereo_matching import MAX_VOLUME_BYTES, candidates, cost_volume_bytes
 from stages.hardware.cluster import fan_out
 from stages.hardware.memory import check_memory
-from stages.io.amounts import short_count
+from stages.io.amounts import counted, short_count
 from stages.io.files import write_durably, write_json
 
 if TYPE_CHECKING:
@@ -204,7 +204,7 @@ def _say_left_out(
     if left_out:
         (one, other), why = next(iter(left_out.items()))
         first = f"{photos.views[one].name} and {photos.views[other].name}: {why}"
-        progress.note("depth.pairs-left-out", f"{len(left_out)} pairs of photos give no depth ({first})")
+        progress.note("depth.pairs-left-out", f"no depth from {counted(len(left_out), 'pair')} of photos ({first})")
     alone = [number for number, others in enumerate(_neighbours(photos, pairs)) if len(others) < 2]
     if alone:
         which = listed(_names(photos, alone), 3)

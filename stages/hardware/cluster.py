@@ -28,6 +28,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 
 from stages.contract import StageError, listed
 from stages.hardware.child_process import child_environment
+from stages.io.amounts import counted
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -95,8 +96,8 @@ def described() -> list[str]:
     if _joined is None:
         return []
     cores, gpus = (sum(getattr(one, name) for one in _joined.machines) for name in ("cores", "gpus"))
-    machines = f"{len(_joined.machines)} machine{'s' * (len(_joined.machines) > 1)}"
-    return [f"cluster of {machines}, {cores} cores" + (f", {gpus} GPUs" if gpus else "")]
+    counts = [counted(len(_joined.machines), "machine"), counted(cores, "core")]
+    return [f"cluster of {', '.join([*counts, *([counted(gpus, 'GPU')] if gpus else [])])}"]
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 import os
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -73,7 +73,7 @@ def note_unused(source: Source, photos: Path, progress: Progress) -> None:
     """Note what lies beside the photos, which were found in ``photos``, and could be used, and how."""
     if beside := photos_beside(source, photos):
         folder = shown(str(photos))
-        lie, them = ("1 photo", "is") if beside == 1 else (f"{beside} photos", "are")
+        lie, them = counted(beside), "is" if beside == 1 else "are"
         how = f"to use all, move them into images/; to use only them, move images/ out of {folder}"
         progress.note("ingest.photos-beside-images", f"{lie} in {folder} beside images/ {them} not used: {how}")
     if source.root != photos.absolute() and (copies := reduced_folders(photos, but=source.root)):
@@ -86,8 +86,11 @@ def note_unused(source: Source, photos: Path, progress: Progress) -> None:
         progress.note("ingest.photos-without-frame", f"{lie} left out, because {file} does not name them: {which}")
     if others := source.other_endings:
         which = listed([f"{shown(photo)} ({shown(path)})" for path, photo in others.items()], 3)
-        words = f"{len(others)} frames use photos of the same name with another file ending: {which}"
-        progress.note("ingest.other-endings", words)
+        progress.note(
+            "ingest.other-endings",
+            f"{counted(len(others), 'frame uses a photo', 'frames use photos')} of the same name with another file "
+            f"ending: {which}",
+        )
     if (cameras := unused_cameras(source)) is not None:
         place, option = shown(str(cameras)), shown(f"--cameras {shlex.quote(str(cameras))}")
         progress.note("ingest.unused-cameras", f"the cameras in {place} are not used; to use them: {option}")
@@ -106,13 +109,14 @@ def excluded(files: Mapping[str, str]) -> list[Note]:
     used = instant_ngp_masks(files).values()
     notes = list[Note]()
     if used:
-        words = f"{len(used)} instant-ngp masks ({shown(min(used))}, …) are used: white is ignored"
+        which = listed([shown(name) for name in sorted(used)], 1)
+        words = f"{counted(len(used), 'instant-ngp mask is', 'instant-ngp masks are')} used ({which}): white is ignored"
         notes.append(Note("ingest.instant-ngp-masks", words))
     files = {name: photo for name, photo in files.items() if name not in used}
     if not files:
         return notes
     named = [f"{shown(name)} (of {shown(photo)})" for name, photo in sorted(files.items())]
-    count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
+    count = _files_are(files)
     words = f"{count} excluded, with the name of a mask, depth map or other copy of a photo: {listed(named, 3)}"
     notes.append(Note("ingest.excluded", words))
     if mask := next((name for name, photo in sorted(files.items()) if photo == ALL_PHOTOS), None):
@@ -137,7 +141,7 @@ def excluded_by_values(files: Sequence[str]) -> list[Note]:
     """A note on files among colour photos whose values are those of depth maps."""
     if not files:
         return []
-    count, named = _count(files), _first_names(files)
+    count, named = _files_are(files), _first_names(files)
     words = f"{count} excluded as depth maps: grey values of 16 bits or floats among colour photos: {named}"
     return [Note("ingest.depth-maps", words)]
 
@@ -146,13 +150,13 @@ def excluded_masks(files: Sequence[str]) -> list[Note]:
     """A note on files among photos that are black and white alone."""
     if not files:
         return []
-    count, named = _count(files), _first_names(files)
+    count, named = _files_are(files), _first_names(files)
     words = f"{count} excluded as masks, because they are pure black and white: {named}. To use them, name each"
     return [Note("ingest.black-and-white", f"{words} masks/NAME.png after its photo; black is ignored")]
 
 
-def _count(files: Sequence[str]) -> str:
-    return "1 file is" if len(files) == 1 else f"{len(files)} files are"
+def _files_are(files: Collection[str]) -> str:
+    return counted(len(files), "file is", "files are")
 
 
 def _first_names(files: Sequence[str]) -> str:
@@ -203,7 +207,7 @@ def note_masks(ignored: Sequence[float], turned: int, resized: int, photos: int,
     polarity = "; black is ignored: invert your masks if white marks what to ignore" if share > MANY_IGNORED else ""
     progress.note(
         "ingest.masks",
-        f"{len(ignored)} of {photos} photos have masks, which ignore {share:.0%} of their pixels"
+        f"{len(ignored)} of {counted(photos)} have masks, which ignore {share:.0%} of their pixels"
         f"{turned_words}{resized_words}{polarity}",
     )
 
@@ -237,7 +241,7 @@ def taken_as_upright(names: Sequence[str]) -> list[Note]:
 
 
 def _photos_are(count: int) -> str:
-    return "1 photo is" if count == 1 else f"{count} photos are"
+    return counted(count, "photo is", "photos are")
 
 
 def _few(names: Sequence[str]) -> str:
@@ -250,7 +254,7 @@ def too_few(source: Source, names: Sequence[str], rejected: Sequence[Rejection])
         first = f"{shown(rejected[0].name)}: {rejected[0].reason}"
         return StageError(
             "ingest.no-usable-photo",
-            f"none of the {len(rejected)} files in {source.root} is a usable photo",
+            f"no usable photo among {counted(len(rejected), 'file')} in {source.root}",
             first,
             _what_to_do(rejected),
         )

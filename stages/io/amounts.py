@@ -13,9 +13,9 @@ def short_count(count: float) -> str:
     return f"{count:.0f}"
 
 
-def counted(count: int, one: str = "photo") -> str:
-    """``1 photo``, ``2 photos``: so many things, each called ``one``."""
-    return f"{count:,} {one}" if count == 1 else f"{count:,} {one}s"
+def counted(count: int, one: str = "photo", many: str | None = None) -> str:
+    """``1 photo``, ``2 photos``: so many things, each called ``one``, and ``many`` where that takes more than an s."""
+    return f"{count:,} {one if count == 1 else many or f'{one}s'}"
 
 
 def duration(seconds: float) -> str:

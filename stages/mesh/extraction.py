@@ -17,6 +17,7 @@ from stages.contract import Inputs, Progress, StageError, StageResult
 from stages.effects.image_effects import learnt_poses, new_view_words
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_bytes, check_memory
+from stages.io.amounts import counted
 from stages.io.field_files import load_field
 from stages.io.files import SMALL_COPY, read_scene, read_tensors, write_png, write_tensors
 from stages.mesh.cleaning import Cleaned, boundary, clean
@@ -307,7 +308,7 @@ def save(config: "Config", extracted: Extracted, source: Source, folder: Path) -
     count = f"{faces / 1000:.0f} k faces" if faces >= 10_000 else f"{faces} faces"
     if (texture := extracted.mesh.texture) is not None:
         count += f", texture {texture.atlas.width} × {texture.atlas.height}"
-    line = f"{count}, {extracted.components} component{'s' * (extracted.components > 1)}, {extracted.boundary}"
+    line = f"{count}, {counted(extracted.components, 'component')}, {extracted.boundary}"
     if extracted.closed.holes:
         line += f", {extracted.closed.area_share:.1%} of the area invented"
     if not extracted.iso_level.well_defined:

@@ -15,6 +15,7 @@ from nerf.geometry.region_of_interest import find_capture_type
 from nerf.geometry.scene import Camera, Scene, Split, View
 from nerf.geometry.up_vector import Witness, up_by_places
 from stages.contract import Inputs, Progress, StageError, StageResult
+from stages.io.amounts import counted
 from stages.io.files import read_json, write_json, write_tensors
 from stages.io.photos import Box, Photo, read_photos
 from stages.io.sparse_model import SparseModel
@@ -89,7 +90,7 @@ def _check(config: "Config", views: int) -> None:
     if views < MIN_VIEWS:
         raise StageError(
             "normalise.few-photos",
-            f"only {views} registered photo{'s' * (views != 1)}",
+            f"only {counted(views, 'registered photo')}",
             f"a scene needs at least {MIN_VIEWS}: two for training and one for testing",
             "Add photos that overlap with these.",
         )

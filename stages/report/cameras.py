@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeGuard
 
+from stages.io.amounts import counted
+
 MAX_DOUBTFUL = 0.05  # fraction of the photos that are excluded, differ from global mapping, or are weakly linked
 MIN_AGREEING = 0.5  # share of the verified pairs
 MIN_SUPPORT = 0.9  # share of the pairs that agree with our poses must agree with the other mapping's, to cast doubt
@@ -86,7 +88,7 @@ def _doubts_of_check(registration: Mapping[str, Any]) -> list[str]:
     weak = {file for link in links for file in link["photos"]}
     # A lone photo at the edge of many does no harm; of a group the place and size beside the rest are not sure.
     if len(weak) > MAX_DOUBTFUL * photos or any(len(link["photos"]) > 1 for link in links):
-        found.append(f"few matches link {_photos(len(weak))} to the rest")
+        found.append(f"few matches link {counted(len(weak))} to the rest")
     return found
 
 
@@ -129,12 +131,8 @@ def _doubts_of_structure(repeated: Mapping[str, Any] | None) -> list[str]:
     if not repeated:
         return []
     others, moved = len(repeated["others"]), len(repeated["photos"])
-    contradict = "contradicts" if others == 1 else "contradict"
-    return [f"repeated structure: {_photos(others)} {contradict} the poses of {moved} others"]
-
-
-def _photos(count: int) -> str:
-    return f"{count} photo{'' if count == 1 else 's'}"
+    contradict = counted(others, "photo contradicts", "photos contradict")
+    return [f"repeated structure: {contradict} the poses of {moved} others"]
 
 
 def _advice(registration: Mapping[str, Any], config: Mapping[str, Any]) -> str:
@@ -160,7 +158,7 @@ def _figures(registration: Mapping[str, Any]) -> str | None:
     if _differs(comparison) and _is_refuted(comparison):
         name = "incremental" if comparison["taken"] else "global"
         support = f"{comparison['agreeing_other']:,} of their image pairs agree with it and {comparison['agreeing']:,}"
-        said.append(f"{name} mapping gives {_photos(len(comparison['different']))} other poses; {support} with these")
+        said.append(f"{name} mapping gives {counted(len(comparison['different']))} other poses; {support} with these")
     elif comparison and not comparison["failed"] and comparison["centre"] is not None:
         same = f"{comparison['agree']} of {comparison['photos']} photos the same pose"
         extent = f"{max(comparison['centre'], MIN_SHOWN):.2%} of the extent"
@@ -199,7 +197,7 @@ def _weak_groups(links: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str
     shown = largest[:MAX_WEAK]
     groups = [
         (
-            f"Linked to the rest by {link['matches']} matches of {_pairs(link['pairs'])}"
+            f"Linked to the rest by {link['matches']} matches of {counted(link['pairs'], 'image pair')}"
             if link["pairs"]
             else "Linked to the rest by inexact matches alone",
             link["photos"],
@@ -208,10 +206,6 @@ def _weak_groups(links: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str
     ]
     others = [file for link in links if link not in shown for file in link["photos"]]
     return [*groups, ("Each linked to the rest by few matches", others)]
-
-
-def _pairs(count: int) -> str:
-    return f"{count} image pair{'' if count == 1 else 's'}"
 
 
 # --- how they were found

@@ -340,7 +340,7 @@ def _curve(results: Results) -> dict[str, Any] | None:
         return None
     words = [doubling_message(points, coming), diminishing_returns_message(points), ssim_message(points)]
     threads = results.curve["threads"]
-    where = "a GPU" if results.curve["device"] == "cuda" else f"{threads} processor core{'' if threads == 1 else 's'}"
+    where = "a GPU" if results.curve["device"] == "cuda" else counted(threads, "processor core")
     sentences = [f"{word[0].upper()}{word[1:]}." for word in words if word]
     return {"svg": Markup(svg), "words": sentences, "where": where, "more": more_option(points)}
 

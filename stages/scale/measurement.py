@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stages.contract import Inputs, Progress, StageResult
+from stages.io.amounts import counted
 from stages.io.files import read_json, read_scene, read_tensors, write_json
 from stages.scale.marker_scale import MAX_ERROR, marker_references
 from stages.scale.references import (
@@ -64,6 +65,6 @@ def _line(used: Sequence[Reference], metres: float | None, error: float | None, 
     if metres is None or error is None:
         return "unknown: none of the lengths given can be used" if asked else "unknown: lengths are in scene units"
     markers = sum(reference.kind == "marker" for reference in used)
-    kinds = {"marker": f"{markers} marker{'s' * (markers > 1)}", "distance": "the distance given", "gps": "GPS"}
+    kinds = {"marker": counted(markers, "marker"), "distance": "the distance given", "gps": "GPS"}
     sources = " and ".join(dict.fromkeys(kinds[reference.kind] for reference in used))
     return f"1 unit = {in_words(metres, error)} by {sources}"

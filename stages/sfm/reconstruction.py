@@ -11,6 +11,7 @@ import numpy as np
 from nerf.geometry.georeference import georeference
 from stages.contract import Note, Progress, StageError, listed
 from stages.hardware.memory import check_memory
+from stages.io.amounts import counted
 from stages.io.photos import Photo, read_photos
 from stages.sfm.colmap.cameras import is_valid
 from stages.sfm.colmap.database.extraction import ExtractionOptions, feature_bytes
@@ -133,10 +134,10 @@ def _check_count(photos: Sequence[Photo], ingested: int) -> None:
     if len(photos) < MIN_REGISTERED:
         why = f"structure from motion needs at least {MIN_REGISTERED} photos that overlap"
         if same := ingested - len(photos):
-            why += f", and {same} are near-duplicates of these"
+            why += f", and {counted(same, 'more is a near-duplicate', 'more are near-duplicates')} of these"
         raise StageError(
             "sfm.few-photos",
-            f"cannot find cameras from {len(photos)} photo{'s' * (len(photos) != 1)}",
+            f"cannot find cameras from {counted(len(photos))}",
             why,
             OVERLAP_HINT,
         )
@@ -198,7 +199,10 @@ def _database(folder: Path, names: Sequence[str], progress: Progress) -> Path:
         return database
     if _are_sound(folder / "strategies") and all(is_sound(one, names) for one in folder.glob("matches-*.db")):
         features, pairs = count_done(database)
-        progress.note("sfm.resumes", f"resuming with the features of {features} photos and {pairs} matched pairs")
+        progress.note(
+            "sfm.resumes",
+            f"resuming with the features of {counted(features)} and {counted(pairs, 'matched pair')}",
+        )
     else:
         progress.note("sfm.damaged-matches", "starting over, because the matches of the interrupted run are damaged")
         _remove_intermediate(folder)
@@ -281,4 +285,4 @@ def _note_weak_links(photos: Sequence[Photo], links: Sequence[dict[str, Any]], p
 
 def _skipped_for_time(count: int) -> str:
     """What the line says of strategies skipped for time: a run with more time takes this result as finished."""
-    return f" · {count} retry strateg{'y' if count == 1 else 'ies'} skipped for time: sfm --force" if count else ""
+    return f" · {counted(count, 'retry strategy', 'retry strategies')} skipped for time: sfm --force" if count else ""

@@ -163,7 +163,7 @@ class Run(NamedTuple):
     @property
     def label(self) -> str:
         """``grid, half resolution, 590 steps, seed 0``."""
-        return f"{self.variant}, {resolution_name(self.downscale)}, {self.steps:,} steps, seed {self.seed}"
+        return f"{self.variant}, {resolution_name(self.downscale)}, {counted(self.steps, 'step')}, seed {self.seed}"
 
     @property
     def options(self) -> dict[str, Any]:
@@ -330,7 +330,8 @@ def list_runs(runs: Sequence[Run]) -> tuple[str, ...]:
         too_few = run.steps < VARIANTS[run.variant].min_steps
         groups.setdefault((run.variant, run.downscale, too_few), []).append(run.steps)
     words = [
-        f"{variant} at {resolution_name(downscale)}: {', '.join(f'{count:,}' for count in steps)} steps"
+        f"{variant} at {resolution_name(downscale)}: "
+        + ", ".join([*(f"{count:,}" for count in steps[:-1]), counted(steps[-1], "step")])
         + f" (fewer than {VARIANTS[variant].min_steps})" * too_few
         for (variant, downscale, too_few), steps in groups.items()
     ]

@@ -245,7 +245,7 @@ def _result_line(result: Result) -> str:
     run, figures = result
     if figures["failed"]:
         return f"{run.label}: no result ({figures['failed']})"
-    restarts = f", restarted {figures['restarts']} times" if figures["restarts"] else ""
+    restarts = f", restarted {counted(figures['restarts'], 'time')}" if figures["restarts"] else ""
     return f"{run.label}: {figures['psnr']:.2f} dB in {duration(figures['train_seconds'])}{restarts}"
 
 
@@ -320,7 +320,7 @@ def _scored_on(outcome: Outcome) -> str:
     tiles = sum(len(crop.truth) // (crop.tile_rows or 1) for crop in crops)
     fewer = f"; {', '.join(dict.fromkeys(slow))}: one in {SCORING_STRIDE} of their rows and columns, to save time"
     return (
-        f"{tiles} tiles of {TILE_SIZE} × {TILE_SIZE} pixels of {len(crops)} test photo{'s' * (len(crops) > 1)} "
+        f"{counted(tiles, 'tile')} of {TILE_SIZE} × {TILE_SIZE} pixels of {counted(len(crops), 'test photo')} "
         f"at {width} × {height}, the same for all{fewer if slow else ''}"
     )
 

@@ -36,7 +36,7 @@ from nerf.training.step_schedule import (
 )
 from nerf.training.trainer import RAY_GEOMETRY, FieldTrainer, NonFinite
 from stages.contract import Progress, StageError
-from stages.io.amounts import short_count
+from stages.io.amounts import counted, short_count
 from stages.io.files import read_json, write_durably
 from stages.io.stopwatch import live_line
 from stages.train.checkpoints import (
@@ -376,7 +376,8 @@ class TrainingRun:
         """Before the state is saved: raise TrainingFailure if it is not finite or, from MIN_HEALTHY_STEPS on, the field
         has collapsed."""
         if name := non_finite_tensor(self.trainer):
-            raise TrainingFailure(f"after {self.state.step:,} steps the field has diverged: its {name} is not finite")
+            steps = counted(self.state.step, "step")
+            raise TrainingFailure(f"after {steps} the field has diverged: its {name} is not finite")
         if self.state.step > MIN_HEALTHY_STEPS and needs_full_check(self.speed.psnr, self.evaluation_sets.train):
             self._check_health_fully()
 

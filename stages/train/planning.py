@@ -16,7 +16,7 @@ from stages.effects.decisions import Decisions, read_decisions
 from stages.effects.image_effects import image_effects
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_on
-from stages.io.amounts import bytes_in_words, duration, short_count
+from stages.io.amounts import bytes_in_words, counted, duration, short_count
 from stages.io.files import read_json, read_scene
 from stages.io.photos import read_photos
 from stages.train.config import SECONDS, Config
@@ -72,9 +72,12 @@ def planned(config: Config, inputs: Inputs, progress: Progress) -> Config:
 
 def reason(config: Config, rays: float) -> str:
     """What sizes that were left open are chosen for."""
-    budget = f"{config.seconds:g} s on this machine" if config.steps is None else f"{config.steps:,} steps"
+    if config.steps is None:
+        budget = f"{config.seconds:g} s on this machine render"
+    else:
+        budget = counted(config.steps, "step renders", "steps render")
     work = field_of(config).work(config, rays)
-    return f"{budget} render about {short_count(rays)} rays{work}; sizes that no option sets follow from that"
+    return f"{budget} about {short_count(rays)} rays{work}; sizes that no option sets follow from that"
 
 
 def _used_shares(ingest: Path, scene: "Scene") -> dict[str, float]:

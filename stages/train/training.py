@@ -204,7 +204,7 @@ def ranks_message(ranks: Ranks, config: Config) -> str:
 
 
 def _note_sizes(config: Config, budget: TrainingBudget, dataset: RayDataset, progress: Progress) -> None:
-    amount = f"{budget.seconds:g} s" if budget.steps is None else f"{budget.steps:,} steps"
+    amount = f"{budget.seconds:g} s" if budget.steps is None else counted(budget.steps, "step")
     another = "" if budget.after is None else "another "
     photos = f"{counted(len(dataset.near))} at 1/{config.downscale:g} of their size"
     field = field_of(config)

@@ -23,6 +23,7 @@ from stages.ingest.panoramas import Panorama, cutting_advice, panorama_kind
 from stages.ingest.sharpness import WIDTH, at_most, sharpness
 from stages.ingest.video.optical_flow import corners, follow_both_ways
 from stages.ingest.video.tone_mapping import srgb_filters
+from stages.io.amounts import counted
 from stages.io.files import stand_in, write_jpeg
 
 FLOW_WIDTH = 500  # pixels of the frames on which motion is measured
@@ -298,11 +299,10 @@ def _panoramas(video: Path, kind: Panorama) -> StageError:
 def _no_way(video: Path, frames: Sequence[Frame]) -> StageError:
     what = f"cannot take photos from {video.name}"
     if len(frames) < MIN_FRAMES:
-        count = f"{len(frames)} frame{'s' * (len(frames) != 1)}"
         return StageError(
             "ingest.short-video",
             what,
-            f"it has only {count}",
+            f"it has only {counted(len(frames), 'frame')}",
             "Film for at least ten seconds while walking around the scene.",
         )
     way = frames[-1].path

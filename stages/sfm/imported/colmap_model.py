@@ -55,7 +55,8 @@ def read_colmap_model(folder: Path, photos: Sequence[Photo], convention: PoseCon
         notes.append(
             Note(
                 "sfm.other-spellings",
-                f"{len(others)} photos take the cameras of images whose names are spelt differently: {few(others)}",
+                f"{counted(len(others), 'photo takes the camera of an image', 'photos take the cameras of images')} "
+                f"spelt differently: {few(others)}",
             )
         )
     if repeated:

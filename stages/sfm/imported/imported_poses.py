@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from stages.contract import Note, StageError
+from stages.io.amounts import counted
 from stages.io.photos import Photo
 from stages.io.sparse_model import SparseModel
 from stages.sfm.imported.posed_photos import PosedPhoto
@@ -62,17 +63,17 @@ def notes_on_photos(
     that were turned upright."""
     notes = []
     bent = [one.photo.name for one in posed if one.file in left_out]
-    for names, code, what in (
-        (absent, "sfm.no-photo", "cameras have no photo"),
-        (unposed, "sfm.no-camera", "photos are left out, because they have no camera"),
-        (bent, "sfm.no-rays", "photos are left out, because their cameras have no ray for some pixels"),
+    no_rays = "left out, because of a camera without rays for some pixels"
+    for names, code, one, many in (
+        (absent, "sfm.no-photo", "camera has no photo", "cameras have no photo"),
+        (unposed, "sfm.no-camera", "photo without a camera is left out", "photos without a camera are left out"),
+        (bent, "sfm.no-rays", f"photo is {no_rays}", f"photos are {no_rays}"),
     ):
         if names:
-            notes.append(Note(code, f"{len(names)} {what}: {few(sorted(names))}"))
+            notes.append(Note(code, f"{counted(len(names), one, many)}: {few(sorted(names))}"))
     if turned := sum(one.turns > 0 and one.file not in left_out for one in posed):
-        notes.append(
-            Note("sfm.turned-upright", f"{turned} cameras are turned upright like their photos (EXIF orientation)")
-        )
+        words = f"{counted(turned, 'camera is', 'cameras are')} turned upright like the photos (EXIF orientation)"
+        notes.append(Note("sfm.turned-upright", words))
     return notes
 
 

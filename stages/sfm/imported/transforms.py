@@ -144,7 +144,10 @@ def _on_frames(found: _MatchedFrames, repeated: Sequence[str]) -> list[Note]:
         )
     approximate = [one for one in found.framed.values() if str(one.values.get("note", "")).startswith(APPROXIMATION)]
     if approximate:
-        words = f"the camera models of {len(approximate)} frames are approximations, according to the notes in the file"
+        words = (
+            f"the camera models of {counted(len(approximate), 'frame')} are approximations, according to the notes in "
+            "the file"
+        )
         notes.append(Note("sfm.approximate-cameras", words))
     if found.poseless:
         count = f"{len(found.poseless)} of {len(found.poseless) + len(found.framed)} frames"
@@ -152,7 +155,7 @@ def _on_frames(found: _MatchedFrames, repeated: Sequence[str]) -> list[Note]:
         notes.append(Note("sfm.frames-without-pose", f"{words}: {few(sorted(found.poseless.values()))}"))
     if found.unused:
         names = few(sorted(found.unused.values()))
-        words = f"{len(found.unused)} photos are in no split of the file and are left out: {names}"
+        words = f"{counted(len(found.unused), 'photo is', 'photos are')} left out, in no split of the file: {names}"
         notes.append(Note("sfm.in-no-split", words))
     return notes
 
@@ -163,7 +166,7 @@ def _nothing_usable(source: str, found: _MatchedFrames, photos: Sequence[Photo])
     return unusable(
         "sfm.no-poses",
         f"the poses of {source}",
-        f"the transform_matrix of all {len(found.poseless)} frames is null, zeros or NaN",
+        f"the transform_matrix of all {counted(len(found.poseless), 'frame')} is null, zeros or NaN",
     )
 
 
@@ -312,7 +315,7 @@ def _rounded_or_scaled(rotations: Mapping[str, NearestRotation]) -> list[Note]:
         notes.append(
             Note(
                 "sfm.rounded-rotations",
-                f"the rotations of {len(rounded)} frames are rounded and {off}: {few(list(rounded))}",
+                f"the rotations of {counted(len(rounded), 'frame')} are rounded and {off}: {few(list(rounded))}",
             )
         )
     if scaled := {name: r.scale for name, r in rotations.items() if abs(r.scale - 1) > SCALED_WITHIN}:
@@ -320,7 +323,8 @@ def _rounded_or_scaled(rotations: Mapping[str, NearestRotation]) -> list[Note]:
         notes.append(
             Note(
                 "sfm.scaled-matrices",
-                f"the matrices of {len(scaled)} frames scale by {by}; the scale is ignored: {few(list(scaled))}",
+                f"the matrices of {counted(len(scaled), 'frame')} scale by {by}; the scale is ignored: "
+                f"{few(list(scaled))}",
             )
         )
     return notes

@@ -15,7 +15,7 @@ from stages.hardware.backend import chosen_backend, load_backend
 from stages.hardware.device import compute_device, cores
 from stages.hardware.memory import available_on
 from stages.hardware.ranks import rank_count
-from stages.io.amounts import bytes_in_words, short_count
+from stages.io.amounts import bytes_in_words, counted, short_count
 from stages.train.config import Config
 from stages.train.data import has_background_model, training_background
 from stages.train.fields.hash_grid_options import MAX_MICRO_BATCHES
@@ -218,7 +218,8 @@ def step_in_words(config: Config) -> str:
         places = f"samples every {stepping.step_size / (2 * Ndc.half):.2%} of 1 / depth from near to infinity"
     else:
         places = f"samples every {stepping.step_size:.2g} scene units{growing}"
-    parts = f"{grid.micro_batches} micro-batch{'' if grid.micro_batches == 1 else 'es'}"
+    assert grid.micro_batches, "plan() chooses it"
+    parts = counted(grid.micro_batches, "micro-batch", "micro-batches")
     step = f"{grid.target_samples:,} colours a step in {parts}, by {grid.backend}"
     return f"{step} · {places}"
 

@@ -110,7 +110,7 @@ def test_too_few_photos_in_words_that_fit(tmp_path: Path, progress: Any) -> None
     (tmp_path / "none").mkdir()
     (tmp_path / "none/a.jpg").write_text("text")
     error = failure(tmp_path / "none", tmp_path / "out2", progress)
-    assert error.code == "ingest.no-usable-photo" and f"1 files in {tmp_path}/none" in error.what
+    assert error.code == "ingest.no-usable-photo" and f"1 file in {tmp_path}/none" in error.what
     assert error.why.startswith("a.jpg: ")
 
     for ending, data, helps in (("cr3", b"raw", "JPEG"), ("jpg", b"<html>", "download"), ("jpg", b"", "again")):

@@ -68,3 +68,4 @@ def test_bytes() -> None:
 def test_one_thing_is_not_several() -> None:
     assert [counted(number, "test photo") for number in (0, 1, 2)] == ["0 test photos", "1 test photo", "2 test photos"]
     assert (counted(1), counted(1234)) == ("1 photo", "1,234 photos")
+    assert [counted(number, "file is", "files are") for number in (1, 2)] == ["1 file is", "2 files are"]

@@ -178,7 +178,7 @@ def test_what_is_too_slow_is_named() -> None:
     speeds = FAST | {PUBLISHED: Speed(0.01, 10.0)}
     made = make_schedule(1800, 1, "bounded", SIZES, speeds, 1000)
     assert PUBLISHED not in {run.variant for run in made.runs}
-    assert "vanilla, published at 1/8 of the resolution: 1 steps (fewer than 300)" in list_runs(made.left_out)
+    assert "vanilla, published at 1/8 of the resolution: 1 step (fewer than 300)" in list_runs(made.left_out)
 
 
 def test_seeds_come_first_where_the_spread_is_judged() -> None:

@@ -98,7 +98,7 @@ def test_a_study_says_what_it_found(whole: tuple[Path, StageResult], photos: dic
     for row in content["points"]:
         assert 5 < row["psnr"] < 60 and row["train_seconds"] > 0 and row["frame_seconds"] > 0
         assert 0.001 < row["model_mb"] < 10 and 50 < row["peak_memory_mb"] < 100_000
-    assert "vanilla, published at full resolution: 1 steps (fewer than 300)" in content["left_out"]
+    assert "vanilla, published at full resolution: 1 step (fewer than 300)" in content["left_out"]
     assert content["points"][content["recommended"] - 1]["pareto_front"]
     assert content["recommendation"] in (folder / "tradeoff.md").read_text()
     assert result.line.endswith(f"{content['recommendation']} Train it: {content['command']}")

@@ -16,6 +16,7 @@ import pycolmap
 from jaxtyping import Float, Int
 
 from stages.contract import Note
+from stages.io.amounts import counted
 from stages.sfm.colmap.adjustment.bundle_adjustment import adjustment_options, bundle_adjust
 from stages.sfm.colmap.adjustment.intrinsics import (
     CAMERA_MODELS,
@@ -92,7 +93,7 @@ def choose(mapped: pycolmap.Reconstruction, seed: int, camera_models: Sequence[s
         candidate = chosen.candidate if chosen else CameraModelCandidate(mapped.camera(group[0]).model_name, False)
         choice.chosen |= dict.fromkeys(group, candidate)
         choice.table += [row | {"group": index, "photos": photos} for row in rows]
-        whose = f"{photos} photo{'s' * (photos != 1)}: " if len(selections) > 1 else ""
+        whose = f"{counted(photos)}: " if len(selections) > 1 else ""
         given = " as given" if len(camera_models) == 1 else ""
         which = f"camera model {candidate.model}{given}, principal point {candidate.principal_point_state}"
         choice.notes.append(Note("sfm.camera-model", f"{whose}{which}: {why}"))

@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 
 from stages.contract import Note
+from stages.io.amounts import counted
 from stages.sfm.colmap.adjustment.bundle_adjustment import adjustment_options, bundle_adjust
 from stages.sfm.colmap.adjustment.camera_model_selection import CameraModels, choose
 from stages.sfm.colmap.adjustment.intrinsics import CAMERA_MODELS, degenerate_cameras, set_camera_models
@@ -84,11 +85,11 @@ def _simplify_degenerate(model: pycolmap.Reconstruction, database: Path, seed: i
     cameras = {_camera(model, image_id).camera_id for image_id in degenerate}
     set_camera_models(model, dict.fromkeys(cameras, SIMPLEST))
     _adjust(model, database, seed, set(model.cameras) - cameras, adjustment_options(False, choice.noise_px))
-    photos = f"{len(degenerate)} photo{'s' * (len(degenerate) != 1)}"
     choice.notes.append(
         Note(
             "sfm.camera-replaced",
-            f"{photos}: the camera is degenerate ({next(iter(degenerate.values()))}): {SIMPLEST} is used instead",
+            f"{counted(len(degenerate))}: the camera is degenerate ({next(iter(degenerate.values()))}): "
+            f"{SIMPLEST} is used instead",
         )
     )
 

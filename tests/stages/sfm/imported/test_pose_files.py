@@ -396,7 +396,7 @@ def test_the_scale_of_a_matrix_is_left_out_and_named(read, scale: float, frames:
         np.testing.assert_allclose(scaled.sfm_from_camera, image.sfm_from_camera, atol=1e-12)
     (note,) = known.notes
     assert note.code == "sfm.scaled-matrices"
-    assert f"{len(frames)} frames" in note.text and f"{scale:g}" in note.text
+    assert f" {len(frames)} frame" in note.text and f"{scale:g}" in note.text
 
 
 OF_OTHERS = {
