@@ -2,9 +2,19 @@
 
 from pathlib import Path
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
-from stages.contract import Inputs, OptionalSourcePath, Progress, SourcePath, Stage, StageConfig, StageResult, Workload
+from stages.contract import (
+    Auto,
+    Inputs,
+    OptionalSourcePath,
+    Progress,
+    SourcePath,
+    Stage,
+    StageConfig,
+    StageResult,
+    Workload,
+)
 from stages.ingest.sources import find_source
 from stages.io.files import write_json
 from stages.io.photos import write_photos
@@ -24,11 +34,22 @@ class Config(StageConfig):
         default=None,
         description="Poses to import for a folder of photos: a transforms file, a COLMAP model or a poses_bounds.npy.",
     )
+    photo_list: Auto[Path] = Field(
+        default=None,
+        description="Use only the photos that this text file names: one name per line, relative to PHOTOS (default: "
+        "all photos).",
+    )
     frames: int = Field(
         default=300,
         ge=MIN_FRAMES,
         description="Maximum number of frames taken from a video; a camera that moves far gets them further apart.",
     )
+
+    @field_validator("photo_list")
+    @classmethod
+    def _absolute(cls, photo_list: Path | None) -> Path | None:
+        """Later commands may be given in another folder."""
+        return photo_list and photo_list.absolute()
 
 
 def expected_seconds(config: Config, workload: Workload) -> float:
@@ -40,7 +61,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """Decode the photos of ``config`` into ``folder``. Raises StageError if fewer than two can be used."""
     from stages.ingest import conversion
 
-    source = find_source(config.photos, config.cameras)
+    source = find_source(config.photos, config.cameras, config.photo_list)
     conversion.messages.note_unused(source, config.photos, progress)
     with conversion.writing(folder):
         converted = conversion.convert(source, config.frames, folder, progress)
