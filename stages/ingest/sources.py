@@ -165,7 +165,7 @@ def _only_listed(source: Source, photo_list: Path) -> Source:
     spelt = {unicodedata.normalize("NFC", name): name for name in names} | {name: name for name in names}
     meant = {line: _meant(line, spelt) for line in read_photo_list(photo_list)}
     if unknown := [line.strip() for line, name in meant.items() if name is None]:
-        raise _not_among_photos(photo_list, len(meant), unknown, names, source.root)
+        raise _not_among_photos(source, photo_list, len(meant), unknown)
     listed_names = {*meant.values()}
     mask_of, _ = pair_masks(names, source.masks)
     of_others = {*mask_of.values()} - {mask for name, mask in mask_of.items() if name in listed_names}
@@ -189,26 +189,26 @@ def _meant(line: str, spelt: Mapping[str, str]) -> str | None:
     return next(map(spelt.__getitem__, known), None)
 
 
-def _not_among_photos(
-    photo_list: Path, lines: int, unknown: Sequence[str], names: Sequence[str], root: Path
-) -> StageError:
+def _not_among_photos(source: Source, photo_list: Path, lines: int, unknown: Sequence[str]) -> StageError:
     few = [
-        shown(name) + (f" (perhaps {shown(similar)})" if (similar := _closest(name, names)) else "")
+        shown(name) + (f" (perhaps {shown(similar)})" if (similar := _closest(name, source)) else "")
         for name in unknown[:MAX_NAMES]
     ]
     return StageError(
         "ingest.photo-list-names",
         f"cannot use the photo list {photo_list}",
         f"no photo matches {len(unknown)} of its {lines} names: {listed([*few, *unknown[MAX_NAMES:]], MAX_NAMES)}",
-        f"Correct the list: names are relative to {root}, as in photos.json.",
+        f"Correct the list: names are relative to {source.root}, as in photos.json.",
     )
 
 
-def _closest(name: str, names: Sequence[str]) -> str | None:
-    """The photo that may be meant: one that is called so in another folder or in other capitals, else a similar name."""
+def _closest(name: str, source: Source) -> str | None:
+    """The photo that may be meant: one that the file of this name belongs to, one that is called so in another folder
+    or in other capitals, or one of a similar name."""
+    names = [source.name(file) for file in source.files]
     last = PurePosixPath(name.replace("\\", "/")).name.lower()
     same = [one for one in names if PurePosixPath(one).name.lower() == last]
-    return next(iter(same or difflib.get_close_matches(name, names, 1)), None)
+    return source.excluded.get(name) or next(iter(same or difflib.get_close_matches(name, names, 1)), None)
 
 
 def _rows(root: Path, files: Sequence[Path]) -> dict[str, str]:
@@ -588,6 +588,6 @@ def _list_of_video(video: Path) -> StageError:
         "ingest.photo-list-of-video",
         f"cannot use --ingest.photo-list with {video.name}",
         "stage ingest chooses the frames of a video, so no list can name them beforehand",
-        "Leave it out; or take the frames first (pipeline run VIDEO --until ingest), then choose from these: pipeline run "
-        "WORKSPACE/output/images --ingest.photo-list FILE -o OTHER.nerf",
+        "Leave it out; or take the frames first (pipeline run VIDEO --until ingest), then choose from these: "
+        "pipeline run WORKSPACE/output/images --ingest.photo-list FILE -o OTHER.nerf",
     )

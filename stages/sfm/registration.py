@@ -175,7 +175,8 @@ def told(reason: Note | None) -> dict[str, str | None]:
 
 def _contradiction(models: Sequence[Sequence[str]], conflict: Mapping[str, Any]) -> Note:
     shares = f"shares {conflict['shared']} with this model and gives {conflict['different']} of them different poses"
-    others = models[conflict["group"]]
+    index: int = conflict["group"]
+    others = models[index]
     group = f"it belongs to a group of {len(others)} photos{_where_listed(others, models)} that {shares}"
     return Note("sfm.unregistered-repeated-structure", f"{group}: repeated structure")
 

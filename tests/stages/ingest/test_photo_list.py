@@ -58,7 +58,16 @@ def test_a_list_of_all_photos_gives_the_same_bytes(tmp_path: Path, progress: Any
         ("./#1.jpg\n", ["#1.jpg"]),
         ("sub/e\u0301 d.jpg\n", ["sub/é d.jpg"]),
     ],
-    ids=["any order", "of Windows", "comments", "other spellings", "spaces inside", "spaces around", "number sign", "accents"],
+    ids=[
+        "any order",
+        "of Windows",
+        "comments",
+        "other spellings",
+        "spaces inside",
+        "spaces around",
+        "number sign",
+        "accents",
+    ],
 )
 def test_lines_are_names(content: str, found: list[str], tmp_path: Path) -> None:
     touch(tmp_path, "a.jpg", "b.jpg", "sub/ c.jpg", "sub/é d.jpg", " e.jpg", "f.jpg ", "#1.jpg")
@@ -127,8 +136,8 @@ def test_frames_of_a_video_cannot_be_listed(tmp_path: Path) -> None:
 
 
 def test_masks_and_copies_follow_their_photos(tmp_path: Path) -> None:
-    touch(tmp_path, *(f"{name}.jpg" for name in "abc"), *(f"masks/{name}.png" for name in "abcx"))
-    touch(tmp_path, "a_depth.png", "b_depth.png", "dynamic_mask_b.png")
+    touch(tmp_path, *(f"{name}.jpg" for name in "abcd"), *(f"masks/{name}.png" for name in "abcx"))
+    touch(tmp_path, "a_depth.png", "b_depth.png", "dynamic_mask_d.png")
     source = find_source(tmp_path, None, listing(tmp_path, "a.jpg\nc.jpg"))
     assert sorted(mask.name for _, mask in source.masks) == ["a.png", "c.png", "x.png"], "x is no photo's"
     assert source.excluded == {"a_depth.png": "a.jpg"}
