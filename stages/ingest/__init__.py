@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from stages.contract import (
     Auto,
@@ -44,12 +44,6 @@ class Config(StageConfig):
         ge=MIN_FRAMES,
         description="Maximum number of frames taken from a video; a camera that moves far gets them further apart.",
     )
-
-    @field_validator("photo_list")
-    @classmethod
-    def _absolute(cls, photo_list: Path | None) -> Path | None:
-        """Later commands may be given in another folder."""
-        return photo_list and photo_list.absolute()
 
 
 def expected_seconds(config: Config, workload: Workload) -> float:

@@ -153,8 +153,7 @@ def read_photo_list(file: Path) -> list[str]:
     except UnicodeDecodeError as error:
         why = f"it is not text in UTF-8 (byte {error.start} is 0x{error.object[error.start]:02x})"
         raise StageError("ingest.photo-list-encoding", what, why, _LIST_HINT) from error
-    lines = [line.removesuffix("\r") for line in text.split("\n")]
-    names = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    names = [line for line in text.split("\n") if line.strip() and not line.lstrip().startswith("#")]
     if not names:
         raise StageError("ingest.photo-list-empty", what, "it names no photo", _LIST_HINT)
     return names
