@@ -99,6 +99,11 @@ def listed(names: Sequence[str], most: int) -> str:
     return ", ".join(names[:most]) + more
 
 
+def shown(name: str) -> str:
+    """A name as it may be printed: nothing in it can steer a terminal."""
+    return name if name.isprintable() else repr(name)
+
+
 class Note(NamedTuple):
     """A line that stays: a decision and its reason, a warning, or why a photo is missing; ``code`` is its name for
     programs, as of errors."""

@@ -24,7 +24,7 @@ from pipeline.cli.options import (
     read_toml,
     settings_from,
     with_effects,
-    with_lasting_cameras,
+    with_lasting_files,
     with_source,
 )
 from pipeline.cli.signals import Terminated, end_soon, go_on, heed_signals
@@ -286,7 +286,7 @@ def _run_stages(
     ``new_budget``: seconds for the whole command (None: no limit), and those spent before; None: as recorded."""
     if "evaluate" in stages:
         check_fitted_poses(settings)
-    settings = with_lasting_cameras(settings, root)
+    settings = with_lasting_files(settings, root)
     if common.cluster is not None:
         root = root.absolute()  # machines of a cluster work in folders of their own
     with Workspace(root) as workspace, cluster.joined(common.cluster, [root]):

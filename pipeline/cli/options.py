@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from pipeline.engine.settings import Settings
 from pipeline.engine.stage_list import STAGES
@@ -21,7 +21,11 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 MAX_WRONG, MAX_LETTERS = 10, 100  # options in one error, and letters of a name or value in it
-WORDS_ALONE = {("ingest", "photos"): "PHOTOS", ("ingest", "cameras"): "--cameras", ("sfm", "cameras"): "--cameras"}
+WORDS_ALONE = {
+    (stage, name): word
+    for stage in ("ingest", "sfm")
+    for name, word in {"photos": "PHOTOS", "cameras": "--cameras"}.items()
+}
 
 
 class UsageError(Exception):
@@ -93,7 +97,7 @@ def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Setti
     """The settings with PHOTOS (and known cameras, if any) filled in. Raises StageError where PHOTOS is unusable,
     UsageError where the photo to render like is none of them or the cameras to render are not there: better now than
     after the training."""
-    source = find_source(photos, cameras)
+    source = find_source(photos, cameras, settings.ingest.photo_list)
     names, like = [source.name(file) for file in source.files], settings.render.match_exposure
     if like is not None and source.kind != "video" and like not in names:
         near = difflib.get_close_matches(like, names, n=3)
@@ -107,7 +111,7 @@ def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Setti
     return settings.model_copy(
         update={
             "ingest": settings.ingest.model_copy(update={"photos": photos.absolute(), "cameras": given}),
-            "sfm": settings.sfm.model_copy(update={"cameras": imported}),
+            "sfm": settings.sfm.model_copy(update={"photos": photos.absolute(), "cameras": imported}),
         }
     )
 
@@ -120,17 +124,19 @@ def check_fitted_poses(settings: Settings) -> None:
         raise UsageError(f"{what}; give --evaluate.fit-poses auto")
 
 
-def with_lasting_cameras(settings: Settings, root: Path) -> Settings:
-    """The settings with cameras that the workspace shows in its ``output/`` named where they stay (:func:`lasting`): a
-    stage that reads them may be the one whose results are taken out of there before it begins."""
-    changed: dict[str, BaseModel] = {}
-    if (cameras := settings.render.cameras) is not None:
-        changed["render"] = settings.render.model_copy(update={"cameras": lasting(cameras, root)})
+def with_lasting_files(settings: Settings, root: Path) -> Settings:
+    """The settings with cameras and a list of photos that the workspace shows in its ``output/`` named where they stay
+    (:func:`lasting`): a stage that reads them may be the one whose results are taken out of there before it begins."""
+    changed: dict[str, dict[str, Path]] = {}
+    for stage, name in (("render", "cameras"), ("ingest", "photo_list")):
+        if (file := getattr(getattr(settings, stage), name)) is not None:
+            changed[stage] = {name: lasting(file, root)}
     if (cameras := settings.sfm.cameras) is not None and (stays := lasting(cameras, root)) != cameras:
-        changed["sfm"] = settings.sfm.model_copy(update={"cameras": stays})
         # Also where the whole output/ was given, in which there may be none the next time.
-        changed["ingest"] = settings.ingest.model_copy(update={"cameras": stays})
-    return settings.model_copy(update=changed)
+        for stage in ("sfm", "ingest"):
+            changed[stage] = {**changed.get(stage, {}), "cameras": stays}
+    options = {stage: getattr(settings, stage).model_copy(update=update) for stage, update in changed.items()}
+    return settings.model_copy(update=options)
 
 
 def check_workspace(root: Path, photos: Path) -> None:

@@ -35,7 +35,7 @@ class RunDigests:
             return self._photos
         if (known := self.run_file.photos_digest) and is_gone(self.source.photos):
             return known
-        source = find_source(self.source.photos, self.source.cameras)
+        source = find_source(self.source.photos, self.source.cameras, self.source.photo_list)
         self.display.update("reading the video" if source.kind == "video" else f"reading {len(source.files)} photos")
         files = self.index.of_files(source.root, (*source.files, *(mask for _, mask in source.masks)))
         masks = [(name, os.path.relpath(mask, source.root)) for name, mask in source.masks]

@@ -15,7 +15,11 @@ from stages.io.files import first_fault, write_durably
 
 NAME = "run.json"
 VERSION = 2
-PATHS = {"ingest": ("photos", "cameras"), "sfm": ("cameras",), "render": ("cameras",)}  # options that are paths
+PATHS = {  # options that are paths
+    "ingest": ("photos", "cameras", "photo_list"),
+    "sfm": ("photos", "cameras"),
+    "render": ("cameras",),
+}
 
 Options = dict[str, dict[str, Any]]
 

@@ -279,17 +279,17 @@ class Workspace:
 
     def stale_folders(self, keys: dict[str, str], stages: list[str]) -> list[Path]:
         """Stage folders that run.json does not use: other keys, abandoned partials, damaged ones. It uses the result
-        that the recorded one goes on from, what the options name as cameras, and a partial of the key until that is
-        finished."""
+        that the recorded one goes on from, what the options name as cameras or list of photos, and a partial of the
+        key until that is finished."""
         current = {self.folder(stage, key) for stage, key in keys.items()}
         current |= {self.partial(stage, key) for stage, key in keys.items() if _whole(self.folder(stage, key)) is None}
         options = self.read_run().options
-        named = (values.get("cameras") for values in options.values())
-        cameras = [Path(os.path.realpath(path)) for path in named if isinstance(path, str)]
+        named = (options.get(stage, {}).get(name) for stage, names in run_file.PATHS.items() for name in names)
+        files = [Path(os.path.realpath(path)) for path in named if isinstance(path, str)]
         current |= {self.folder(s, after) for s, o in options.items() if isinstance(after := o.get("after"), str)}
         found = (p for stage in stages if (self.root / stage).is_dir() for p in (self.root / stage).iterdir())
         ours = (p for p in found if p.is_dir() and _KEY.match(p.name) and p not in current)  # others are not ours
-        return sorted(p for p in ours if not any(path.is_relative_to(os.path.realpath(p)) for path in cameras))
+        return sorted(p for p in ours if not any(path.is_relative_to(os.path.realpath(p)) for path in files))
 
 
 def lasting(path: Path, root: Path) -> Path:

@@ -22,7 +22,7 @@ def photos_of(config: "IngestConfig") -> Photos | None:
     from stages.ingest.video.frames import expected_frames
 
     try:
-        source = find_source(config.photos, config.cameras)
+        source = find_source(config.photos, config.cameras, config.photo_list)
         if source.kind == "video":
             number, width, height = expected_frames(source.files[0], config.frames)
             return Photos(number, width * height / 1e6)

@@ -4,7 +4,17 @@ from pathlib import Path
 
 from pydantic import Field
 
-from stages.contract import Inputs, OptionalSourcePath, Progress, SourcePath, Stage, StageConfig, StageResult, Workload
+from stages.contract import (
+    Auto,
+    Inputs,
+    OptionalSourcePath,
+    Progress,
+    SourcePath,
+    Stage,
+    StageConfig,
+    StageResult,
+    Workload,
+)
 from stages.ingest.sources import find_source
 from stages.io.files import write_json
 from stages.io.photos import write_photos
@@ -24,6 +34,11 @@ class Config(StageConfig):
         default=None,
         description="Poses to import for a folder of photos: a transforms file, a COLMAP model or a poses_bounds.npy.",
     )
+    photo_list: Auto[Path] = Field(
+        default=None,
+        description="Use only the photos that this text file names: one name per line, relative to PHOTOS (default: "
+        "all photos).",
+    )
     frames: int = Field(
         default=300,
         ge=MIN_FRAMES,
@@ -40,7 +55,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """Decode the photos of ``config`` into ``folder``. Raises StageError if fewer than two can be used."""
     from stages.ingest import conversion
 
-    source = find_source(config.photos, config.cameras)
+    source = find_source(config.photos, config.cameras, config.photo_list)
     conversion.messages.note_unused(source, config.photos, progress)
     with conversion.writing(folder):
         converted = conversion.convert(source, config.frames, folder, progress)

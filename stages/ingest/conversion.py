@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from stages.contract import Note, Progress, StageError
+from stages.contract import Note, Progress, StageError, shown
 from stages.hardware.device import processors
 from stages.hardware.memory import at_once, check_memory
 from stages.ingest import messages
@@ -26,7 +26,6 @@ from stages.ingest.auxiliary_files import Stored, depth_maps, masks_by_values, p
 from stages.ingest.decoding import CameraKey, DecodeError, decode, pixel_count
 from stages.ingest.exif import GpsPosition
 from stages.ingest.masks import are_of_stored_pixels, read_mask
-from stages.ingest.messages import shown
 from stages.ingest.near_duplicates import Exposure, exposure, near_duplicates, small, thumbnail, well_exposed
 from stages.ingest.panoramas import Panorama, cutting_advice
 from stages.ingest.sharpness import one_colour, relative_sharpness, sharpness

@@ -1,7 +1,7 @@
-"""Which files below a folder may be photos, or the one video there. Told by their names: no file is opened."""
+"""Which files below a folder may be photos, or the one video there, told by their names; and lists of photos."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from stages.contract import StageError
@@ -34,6 +34,7 @@ _OF_SYSTEMS = (
 )  # fmt: skip
 MAX_OTHER_FILES = 2  # files beside a video, too few to be a set of photos
 FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
+_LIST_HINT = "Write one photo name per line, relative to PHOTOS, in UTF-8; lines that begin with # are ignored."
 _LINKS_HINT = "Fetch them (git annex get, dvc pull), or connect the drive that holds them."
 
 
@@ -138,3 +139,28 @@ def _no_photos(root: Path, found: list[Path], videos: list[Path]) -> StageError:
         f"none of its {len(found)} files is an image ({suffixes})",
         FOLDER_HINT,
     )
+
+
+def read_photo_list(file: Path) -> list[str]:
+    """The lines of a text file, as they stand there, that are not blank and no comments (``#``): names of photos.
+    Raises StageError where it cannot be read, is not UTF-8 or has none."""
+    what = f"cannot use the photo list {file}"
+    try:
+        text = file.read_bytes().decode("utf-8-sig")  # -sig: Windows writes a byte order mark
+    except OSError as error:
+        why = (error.strerror or str(error)).lower()
+        raise StageError("ingest.photo-list-unreadable", what, why, "Check --ingest.photo-list.") from error
+    except UnicodeDecodeError as error:
+        why = f"it is not text in UTF-8 (byte {error.start} is 0x{error.object[error.start]:02x})"
+        raise StageError("ingest.photo-list-encoding", what, why, _LIST_HINT) from error
+    names = [line for line in text.split("\n") if line.strip() and not line.lstrip().startswith("#")]
+    if not names:
+        raise StageError("ingest.photo-list-empty", what, "it names no photo", _LIST_HINT)
+    return names
+
+
+def write_photo_list(file: Path, names: Iterable[str]) -> None:
+    """Write a list that :func:`read_photo_list` reads, folders included."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    lines = (f"./{name}" if name.lstrip().startswith("#") else name for name in names)
+    file.write_bytes("".join(f"{line}\n" for line in lines).encode())

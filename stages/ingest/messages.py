@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from stages.contract import Note, Progress, StageError, listed
+from stages.contract import Note, Progress, StageError, listed, shown
 from stages.ingest.auxiliary_files import ALL_PHOTOS, instant_ngp_masks, is_mask
 from stages.ingest.masks import STILL_BACKGROUND_HINT
 from stages.ingest.near_duplicates import Brackets
@@ -29,11 +29,6 @@ IDENTICAL = "ingest.identical"  # the code of a file with the pixels of another 
 MANY_IGNORED = 0.6  # of the pixels: masks that are meant the other way round ignore so many
 NEARLY_BLACK = 16  # of 255: the most that 12 bits make in a file of 16
 HINT = "Take 20 to 100 overlapping photos of one scene from different places and put them into one folder."
-
-
-def shown(name: str) -> str:
-    """A name as it may be printed: nothing in it can steer a terminal."""
-    return name if name.isprintable() else repr(name)
 
 
 def identical(name: str) -> Note:
@@ -321,6 +316,9 @@ def summary(source: Source, photos: Sequence[Photo], rejected: Sequence[Rejectio
     line = f"{len(photos)} {what} {size}{alpha}, {_cameras(source, photos)}"
     if photos[-1].time_s is not None:
         line += f", {photos[-1].time_s:.1f} s of video"
+    if source.photo_list is not None:
+        all_photos = len(source.files) + source.unlisted
+        line += f", {len(source.files)} of {all_photos} photos listed in {shown(source.photo_list.name)}"
     return f"{line}, {len(rejected)} rejected" if rejected else line
 
 

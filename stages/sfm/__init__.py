@@ -31,6 +31,7 @@ BUDGET_SHARE = 0.5  # of a budget: what it may take before it extracts fewer fea
 class Config(StageConfig):
     """How camera poses and intrinsics are found."""
 
+    photos: OptionalSourcePath = Field(default=None, description="What was given as PHOTOS, for messages.")
     cameras: OptionalSourcePath = Field(
         default=None,
         description="Poses to import: a transforms file or a folder of them, a COLMAP model or a poses_bounds.npy.",
@@ -161,7 +162,8 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
-    """Write ``sparse/`` and registration.json. Raises StageError where no usable model comes out."""
+    """Write ``sparse/``, registration.json and, where photos form other groups, ``photo_groups/``. Raises StageError
+    where no usable model comes out."""
     from stages.sfm import reconstruction
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -169,7 +171,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     write_json(folder / "registration.json", registration)
     return StageResult(
         outputs=("sparse", "registration.json"),
-        records=("sfm.log",),
+        records=("sfm.log", *["photo_groups"] * (folder / "photo_groups").is_dir()),
         line=_line(registration) + skipped,
         facts={name: fact for name, fact in registration.items() if name not in ("images", "test_files")},
     )
@@ -191,16 +193,16 @@ def _line(registration: dict[str, Any]) -> str:
 STAGE = Stage(
     name="sfm",
     inputs=("ingest",),
-    version=34,
+    version=35,
     exit_code=11,
     resumes=True,
-    published=("sparse", "registration.json"),
+    published=("sparse", "registration.json", "photo_groups"),
     config=Config,
-    # Both may make the stage skip a retry strategy, the first one the check of imported poses; it then says so. They
-    # stay out of the key, so that a run with another limit finds the matches of the one before it and resumes from
-    # them. ``seconds`` also sets the quality of feature extraction, which enters the key by options of its own
-    # (max_image_size, max_features).
-    not_hashed=("max_seconds", "seconds"),
+    # PHOTOS is for messages alone. Both limits may make the stage skip a retry strategy, ``max_seconds`` the check of
+    # imported poses; it then says so. They stay out of the key, so that a run with another limit finds the matches of
+    # the one before it and resumes from them. ``seconds`` also sets the quality of feature extraction, which enters the
+    # key by options of its own (max_image_size, max_features).
+    not_hashed=("photos", "max_seconds", "seconds"),
     plan=plan,
     run=run,
     expected_seconds=expected_seconds,

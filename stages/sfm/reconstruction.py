@@ -11,7 +11,9 @@ import numpy as np
 from nerf.geometry.georeference import georeference
 from stages.contract import Note, Progress, StageError, listed
 from stages.hardware.memory import check_memory
+from stages.ingest.listing import write_photo_list
 from stages.io.amounts import counted
+from stages.io.ascii_names import shell_quoted
 from stages.io.photos import Photo, read_photos
 from stages.sfm.colmap.cameras import is_valid
 from stages.sfm.colmap.database.extraction import ExtractionOptions, feature_bytes
@@ -26,9 +28,11 @@ from stages.sfm.registration import (
     MIN_REGISTERED,
     NEAR_DUPLICATE,
     OVERLAP_HINT,
+    PHOTO_GROUPS,
     count_done,
     image_rows,
     is_sound,
+    photo_groups,
     read_matches,
     repeated_structure,
     why_no_model,
@@ -37,7 +41,7 @@ from stages.sfm.registration import (
 from stages.sfm.retry_strategies import LOG, read_kept, read_notes
 from stages.sfm.worker_process import run_worker
 
-MAX_NAMES = 5
+MAX_NAMES, MAX_COMMANDS = 5, 3
 # Of the worker's result, what registration.json takes as it is.
 FACTS = (
     "strategies",
@@ -113,6 +117,7 @@ def _reconstruct(
             "sfm.repeated-structure", repeated_structure(conflict, {photo.image_name: photo.name for photo in photos})
         )
     _note_unregistered(photos, images, progress)
+    list_groups(config.photos, photos, models, folder, progress)
     _note_weak_links(photos, found["check"]["weak_links"], progress)
     registration = _registration(
         "sfm",
@@ -274,6 +279,30 @@ def _note_unregistered(photos: Sequence[Photo], images: list[dict[str, Any]], pr
         by_reason.setdefault(reason, []).append(name)
     for reason, who in by_reason.items():
         progress.note(*reason._replace(text=f"  {listed(who, MAX_NAMES)}: {reason.text}"))
+
+
+def list_groups(
+    given: Path | None, photos: Sequence[Photo], models: Sequence[Sequence[str]], folder: Path, progress: Progress
+) -> None:
+    """List the photos of each further sub-model in a file, and note how to run them by themselves; ``given`` is
+    PHOTOS."""
+    shutil.rmtree(folder / PHOTO_GROUPS, ignore_errors=True)  # of an interrupted run
+    workspace = folder.absolute().parent.parent
+    if any(photo.time_s is not None for photo in photos):  # frames that ingest has taken from a video
+        given = workspace / "output" / "images"
+    name_of = {photo.image_name: photo.name for photo in photos}
+    groups = photo_groups(models)
+    for number, (file, members) in enumerate(groups.items(), start=2):
+        names = [name_of[member] for member in members]
+        write_photo_list(folder / file, names)
+        other = workspace.parent / f"{workspace.stem}-{number}{workspace.suffix}"
+        words = (given or "PHOTOS", "--ingest.photo-list", workspace / "output" / file, "-o", other)
+        command = " ".join(["pipeline run", *(shell_quoted(str(word)) for word in words)])
+        if number < 2 + MAX_COMMANDS:
+            which = f"{len(names)} photos form another group ({listed(names, MAX_NAMES)})"
+            progress.note("sfm.photo-group", f"{which}; to run it by itself: {command}")
+    if (more := len(groups) - MAX_COMMANDS) > 0:
+        progress.note("sfm.more-photo-groups", f"… and {counted(more, 'more group')}, listed in output/{PHOTO_GROUPS}/")
 
 
 def _note_weak_links(photos: Sequence[Photo], links: Sequence[dict[str, Any]], progress: Progress) -> None:

@@ -24,6 +24,7 @@ MIN_REGISTERED = 3  # one to hold out, two to learn from; two views alone fit ma
 MIN_MODEL_POINTS = 100
 MIN_FEATURES = 50
 MAX_NAMES = 5
+PHOTO_GROUPS = "photo_groups"  # the folder of lists of photos that other sub-models than the best one have
 MAX_SAME_VIEW_PX = 1.0
 PLANAR_CONFIGS = (4, 5, 6)  # colmap TwoViewGeometry: PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
 PAIR_BASE = 2**31 - 1  # pair_id = PAIR_BASE * first image id + second image id
@@ -154,6 +155,19 @@ def image_rows(
     return entries
 
 
+def photo_groups(models: Sequence[Sequence[str]]) -> dict[str, list[str]]:
+    """By the file that lists them, the photos of further sub-models that may be run by themselves, the largest first:
+    of at least MIN_REGISTERED photos, some of which the best one lacks. It is number 1, and has no file."""
+    further = [list(model) for model in models[1:] if len(model) >= MIN_REGISTERED and not {*model} <= {*models[0]}]
+    ordered = sorted(further, key=lambda model: (-len(model), model))
+    return {f"{PHOTO_GROUPS}/{number}.txt": model for number, model in enumerate(ordered, start=2)}
+
+
+def _where_listed(model: Sequence[str], models: Sequence[Sequence[str]]) -> str:
+    file = next((file for file, photos in photo_groups(models).items() if photos == list(model)), None)
+    return f" (listed in output/{file})" if file else ""
+
+
 def told(reason: Note | None) -> dict[str, str | None]:
     """Why a photo is unregistered, as registration.json has it."""
     return {"reason": reason and reason.text, "reason_code": reason and reason.code}
@@ -161,7 +175,9 @@ def told(reason: Note | None) -> dict[str, str | None]:
 
 def _contradiction(models: Sequence[Sequence[str]], conflict: Mapping[str, Any]) -> Note:
     shares = f"shares {conflict['shared']} with this model and gives {conflict['different']} of them different poses"
-    group = f"it belongs to a group of {len(models[conflict['group']])} photos that {shares}"
+    index: int = conflict["group"]
+    others = models[index]
+    group = f"it belongs to a group of {len(others)} photos{_where_listed(others, models)} that {shares}"
     return Note("sfm.unregistered-repeated-structure", f"{group}: repeated structure")
 
 
@@ -205,7 +221,8 @@ def _reason(
     if not mine.any():
         return Note("sfm.unregistered-no-match", f"no other photo matches it{few}")
     if others := [model for model in models[1:] if names[index] in model]:
-        group = f"it belongs to a group of {len(others[0])} photos that does not connect to the model"
+        where = _where_listed(others[0], models)
+        group = f"it belongs to a group of {len(others[0])} photos{where} that does not connect to the model"
         return Note("sfm.unregistered-other-group", group)
     partners = matches.pairs[mine].sum(axis=1) - index
     in_model = np.array([names[partner] in models[0] for partner in partners])

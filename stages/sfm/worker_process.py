@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 PHASES = {"features": (0.0, 0.35), "matching": (0.35, 0.5), "mapping": (0.85, 0.15)}
 FIRST_STRATEGY, REFINING = 0.7, 0.95  # where they end and begin in the whole
 MIN_FREE_BYTES = 1 << 22  # less than the smallest of COLMAP's files that may have found no room
-OF_IMPORTED_POSES = {"cameras", "camera_axes", "pose_direction", "adjust_poses"}  # not passed to the worker
+NOT_PASSED = {"photos", "cameras", "camera_axes", "pose_direction", "adjust_poses"}  # to the worker
 COMMAND = ["-P", "-m", "stages.sfm.worker"]  # -P: nothing that lies in the current folder is taken for a module
 
 
@@ -44,7 +44,7 @@ def run_worker(
         "database": str(database.absolute()),
         "photos": [asdict(photo) for photo in photos],
         "cluster": cluster.address(),
-        **config.model_dump(exclude=OF_IMPORTED_POSES),
+        **config.model_dump(exclude=NOT_PASSED),
     }
     latest: dict[str, Any] = {"phase": "features", "database": job["database"], "done": 0, "pairs": 0}
     latest["strategy"] = STRATEGIES[0].name

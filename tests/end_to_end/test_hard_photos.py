@@ -1,5 +1,7 @@
 """What structure-from-motion makes of photo sets that it finds hard: the right cameras, or the right words."""
 
+import json
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 
 from nerf.geometry.alignment import align
+from pipeline.cli.commands import run_command
 from stages import ingest, sfm
 from stages.contract import Note, StageError, run_stage
 from stages.io.files import read_json
@@ -117,6 +120,22 @@ def test_the_larger_of_two_groups_is_taken(tmp_path: Path) -> None:
     strategies = read_json(folder / "registration.json")["strategies"]
     assert strategies[0]["registered"] == 9
     assert any(code == "sfm.unregistered" and "7 of 16" in text for code, text in notes)
+
+
+def test_the_other_group_runs_by_its_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    shoot(tmp_path / "my photos", TWO_GROUPS)
+    up_to_sfm = ["--until", "sfm", "--sfm.max-strategies", "1", "--json"]
+    assert run_command(["run", str(tmp_path / "my photos"), "-o", str(tmp_path / "w.nerf"), *up_to_sfm]) == 0
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    (note,) = [event["message"] for event in events if event.get("code") == "sfm.photo-group"]
+    _, _, command = note.partition("pipeline ")
+    assert run_command([*shlex.split(command), *up_to_sfm]) == 0
+    (other,) = {*tmp_path.glob("*.nerf")} - {tmp_path / "w.nerf"}
+    photos = [photo["name"] for photo in read_json(other / "output/photos.json")["photos"]]
+    assert photos == [shot.name for shot in TWO_GROUPS if shot.scene == PLANE]
+    assert missing(other / "output") == {}
+    assert 0 < max(max(pair) for pair in errors(other / "output", TWO_GROUPS).values()) < 1
+    assert not (other / "output/photo_groups").exists()
 
 
 def test_blurred_photos_are_named_and_do_no_harm(tmp_path: Path) -> None:

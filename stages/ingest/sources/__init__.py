@@ -3,17 +3,27 @@
 Cheap: lists folders and reads at most the JSON of a transforms file, never an image.
 """
 
+import difflib
 import os
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
-from stages.contract import StageError, listed
-from stages.ingest.auxiliary_files import IGNORED, ONE_FOR_ALL, auxiliary_files, instant_ngp_masks, is_mask, pair_masks
+from stages.contract import StageError, listed, shown
+from stages.ingest.auxiliary_files import (
+    ALL_PHOTOS,
+    IGNORED,
+    ONE_FOR_ALL,
+    auxiliary_files,
+    instant_ngp_masks,
+    is_mask,
+    pair_masks,
+)
 from stages.ingest.listing import (
     FOLDER_HINT,
     IMAGES,
@@ -24,6 +34,7 @@ from stages.ingest.listing import (
     is_video,
     list_photos,
     may_be_photo,
+    read_photo_list,
     walk_photos,
 )
 from stages.ingest.sources.camera_files import (
@@ -41,6 +52,7 @@ from stages.io.transforms_files import TRAIN, photo_names, read_splits
 
 SourceKind = Literal["photos", "video", "transforms", "blender", "colmap", "llff"]
 
+MAX_NAMES = 5
 _REDUCED = re.compile(r"images_(\d+)")
 _OF_MASKS = re.compile(
     r"(.+[._-])?masks?([._-].*)?|seg(mentation|mentations|s)?|silhouettes?|mattes?|alphas?", re.IGNORECASE
@@ -61,6 +73,8 @@ class Source:
     named masks, each after the name, relative to ``root``, that it would have without such a folder in it. ``excluded``
     are files in a folder of photos that belong to one of them by their names, as a depth map does, and that photo, by
     name. ``other_endings`` are those of ``frames`` whose photo has another ending than its file_path.
+    Where a ``photo_list`` was given, all but ``frames`` are of the photos that it names alone; ``unlisted`` is how many
+    others there are.
     """
 
     kind: SourceKind
@@ -71,6 +85,8 @@ class Source:
     masks: tuple[tuple[str, Path], ...] = ()
     excluded: Mapping[str, str] = field(default_factory=dict)
     other_endings: Mapping[str, str] = field(default_factory=dict)
+    photo_list: Path | None = None
+    unlisted: int = 0
 
     def name(self, file: Path) -> str:
         """The name of one of ``files``: relative to ``root``, with forward slashes, always encodable as UTF-8."""
@@ -81,16 +97,20 @@ def _name(root: Path, file: Path, below: Path = Path()) -> str:
     return os.fsencode((below / file.relative_to(root)).as_posix()).decode("utf-8", "backslashreplace")
 
 
-def find_source(photos: Path, cameras: Path | None = None) -> Source:
-    """Decide what PHOTOS is. Raises StageError where there is nothing to work on or the choice is not clear."""
+def find_source(photos: Path, cameras: Path | None = None, photo_list: Path | None = None) -> Source:
+    """Decide what PHOTOS is, and which of them ``photo_list`` names, None for all. Raises StageError where there is
+    nothing to work on or the choice is not clear."""
     photos, cameras = photos.absolute(), cameras and cameras.absolute()
     try:
         _check_given(photos, cameras)
         source = _source(photos, cameras)
         if source.kind != "video":
-            return replace(source, masks=source.masks + _list_masks(source.root, source.files) + _beside(source))
+            source = replace(source, masks=source.masks + _list_masks(source.root, source.files) + _beside(source))
+            return source if photo_list is None else _only_listed(source, photo_list)
         if cameras is not None:
             raise _cameras_of_video(source.files[0])
+        if photo_list is not None:
+            raise _list_of_video(source.files[0])
         return source
     except OSError as error:
         raise cannot_read(error.filename or photos, error) from error
@@ -127,6 +147,59 @@ def _source(photos: Path, cameras: Path | None) -> Source:
     if cameras is not None:
         return Source("colmap", root, cameras, files, excluded=excluded)
     return Source("photos", root, None, files, excluded=excluded)
+
+
+def _only_listed(source: Source, photo_list: Path) -> Source:
+    """``source`` with those of its photos alone that a list names, and with what belongs to them. Raises StageError
+    where it names others."""
+    names = [source.name(file) for file in source.files]
+    spelt = {unicodedata.normalize("NFC", name): name for name in names} | {name: name for name in names}
+    meant = {line: _meant(line, spelt) for line in read_photo_list(photo_list)}
+    if unknown := [line.strip() for line, name in meant.items() if name is None]:
+        raise _not_among_photos(source, photo_list, len(meant), unknown)
+    listed_names = {*meant.values()}
+    mask_of, _ = pair_masks(names, source.masks)
+    of_others = {*mask_of.values()} - {mask for name, mask in mask_of.items() if name in listed_names}
+    return replace(
+        source,
+        files=tuple(file for file, name in zip(source.files, names, strict=True) if name in listed_names),
+        masks=tuple((name, mask) for name, mask in source.masks if mask not in of_others),
+        excluded={file: of for file, of in source.excluded.items() if of in listed_names or of == ALL_PHOTOS},
+        other_endings={path: name for path, name in source.other_endings.items() if name in listed_names},
+        photo_list=photo_list,
+        unlisted=len({*names} - listed_names),
+    )
+
+
+def _meant(line: str, spelt: Mapping[str, str]) -> str | None:
+    """The name that a line of a list stands for: as it is, without spaces around it and ``./``, with the backslashes of
+    Windows, or with accents composed in another way; None for none. ``spelt``: all names by their spellings."""
+    plain = PurePosixPath(line.strip()).as_posix()
+    tried = (line, plain, plain.replace("\\", "/"))
+    known = (one for name in tried for one in (name, unicodedata.normalize("NFC", name)) if one in spelt)
+    return next(map(spelt.__getitem__, known), None)
+
+
+def _not_among_photos(source: Source, photo_list: Path, lines: int, unknown: Sequence[str]) -> StageError:
+    few = [
+        shown(name) + (f" (perhaps {shown(similar)})" if (similar := _closest(name, source)) else "")
+        for name in unknown[:MAX_NAMES]
+    ]
+    return StageError(
+        "ingest.photo-list-names",
+        f"cannot use the photo list {photo_list}",
+        f"no photo matches {len(unknown)} of its {lines} names: {listed([*few, *unknown[MAX_NAMES:]], MAX_NAMES)}",
+        f"Correct the list: names are relative to {source.root}, as in photos.json.",
+    )
+
+
+def _closest(name: str, source: Source) -> str | None:
+    """The photo that may be meant: one that the file of this name belongs to, one that is called so in another folder
+    or in other capitals, or one of a similar name."""
+    names = [source.name(file) for file in source.files]
+    last = PurePosixPath(name.replace("\\", "/")).name.lower()
+    same = [one for one in names if PurePosixPath(one).name.lower() == last]
+    return source.excluded.get(name) or next(iter(same or difflib.get_close_matches(name, names, 1)), None)
 
 
 def _rows(root: Path, files: Sequence[Path]) -> dict[str, str]:
@@ -205,7 +278,7 @@ def photos_without_frame(source: Source) -> list[str]:
     """Photos that a transforms file does not name, in the folders of those that it names."""
     if source.kind != "transforms":
         return []
-    named = {source.name(file) for file in source.files}
+    named = {*source.frames.values()}
     inside = {
         child for folder in {file.parent for file in source.files} if folder.is_dir() for child in folder.iterdir()
     }
@@ -377,4 +450,14 @@ def _cameras_of_video(video: Path) -> StageError:
         f"cannot use --cameras with {video.name}",
         "stage ingest chooses the frames of a video, so no poses can be imported for them",
         "Leave out --cameras, or give the folder of the photos that the cameras belong to.",
+    )
+
+
+def _list_of_video(video: Path) -> StageError:
+    return StageError(
+        "ingest.photo-list-of-video",
+        f"cannot use --ingest.photo-list with {video.name}",
+        "stage ingest chooses the frames of a video, so no list can name them beforehand",
+        "Leave it out; or take the frames first (pipeline run VIDEO --until ingest), then choose from these: "
+        "pipeline run WORKSPACE/output/images --ingest.photo-list FILE -o OTHER.nerf",
     )

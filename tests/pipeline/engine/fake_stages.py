@@ -16,6 +16,7 @@ calls: list[str] = []
 class IngestConfig(StageConfig):
     photos: Path = Path()
     cameras: Path | None = None
+    photo_list: Path | None = None
     number: int = 1
 
 

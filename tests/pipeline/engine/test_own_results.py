@@ -87,6 +87,22 @@ def test_cameras_of_another_workspace_are_recorded_as_shown(workspace: Path, pho
     assert seen[0].ingest.cameras == seen[0].sfm.cameras == shown
 
 
+def test_a_photo_list_is_read_where_it_stays(workspace: Path, photos: Path, tmp_path: Path, seen: list):
+    stays = workspace / "sfm" / KEY / "photo_groups/2.txt"
+    stays.parent.mkdir()
+    stays.write_text("0.png\n")
+    with Workspace(workspace) as held:
+        held.link_outputs(workspace / "sfm" / KEY, ("photo_groups",))
+    given = ["--ingest.photo-list", str(workspace / "output/photo_groups/2.txt")]
+    for root in (workspace, tmp_path / "other.nerf"):
+        assert run_command(["run", str(photos), "-o", str(root), *given]) == 0
+    assert [settings.ingest.photo_list for settings in seen] == [stays, Path(given[1])]
+    with Workspace(workspace) as held:
+        held.write_run(RunFile(options={"ingest": {"photo_list": str(stays)}}))
+    assert run_command(["clean", str(workspace)]) == 0
+    assert stays.exists() and not (workspace / "render" / KEY).exists()
+
+
 def test_links_of_the_user_s_own_are_recorded_as_given(workspace: Path, photos: Path, tmp_path: Path, seen: list):
     (tmp_path / "mine.json").symlink_to(workspace / "normalise" / KEY / "transforms.json")
     (tmp_path / "link").symlink_to(photos)

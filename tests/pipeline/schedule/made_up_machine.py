@@ -50,6 +50,7 @@ class Timed(StageConfig):
 
     photos: Path = Path()
     cameras: Path | None = None
+    photo_list: Path | None = None
     seconds: float | None = None
     units: int | None = None
     pace: float = 1.0
@@ -68,6 +69,7 @@ class Training(Timed):
 class Fixed(StageConfig):
     photos: Path = Path()
     cameras: Path | None = None
+    photo_list: Path | None = None
     budget: dict[str, Any] | None = None
     resumed: tuple[str, ...] | None = None
 
