@@ -63,7 +63,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 STAGE = Stage(
     name="ingest",
     inputs=(),
-    version=23,
+    version=24,
     exit_code=10,
     published=("photos.json", NOTES, "images", "masks", "opaque"),
     config=Config,
