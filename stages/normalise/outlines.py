@@ -27,7 +27,9 @@ MAX_IGNORED = 0.03
 # a margin of 3 % of the longer side, or boxes with a margin around them, 0.5.
 MIN_EDGE = 2 / 3
 MIN_SLOPE = 1e-9  # for a direction to be told
-MIN_HIDDEN = 5  # points in a narrow part that a mask ignores, half as dense as in what it leaves, for it to hide them
+# Points in a narrow part that a mask ignores, and how dense beside those in what it leaves, for it to hide them. Of 107
+# photos of two statues none has so many more than 0.3 as dense; behind a rod two cells wide they are 0.6 or denser.
+MIN_HIDDEN, MIN_DENSITY = 5, 0.5
 
 
 class Outline(NamedTuple):
@@ -55,7 +57,8 @@ def read_outline(
     shown = _shown(points, model, image)
     if len(shown) < MIN_POINTS:
         return Outline(cells, box_of(cells < 0.5), follows=False)
-    follows = float((_at(cells, shown) == 1).mean()) <= MAX_IGNORED and not hides_narrow_parts(fine, shown)
+    hidden = cells == 1  # whole cells
+    follows = float(_at(hidden, shown).mean()) <= MAX_IGNORED and not hides_narrow_parts(hidden, shown)
     return Outline(cells, box_of(cells < 0.5), follows)
 
 
@@ -83,13 +86,14 @@ def _at(picture: np.ndarray, places: Float[np.ndarray, "n 2"]) -> np.ndarray:
     return picture[row, column]
 
 
-def hides_narrow_parts(ignored: Bool[np.ndarray, "h w"], places: Float[np.ndarray, "n 2"]) -> bool:
-    """Whether a mask hides something thin in front of what it leaves, such as a rod, which hides too few points to tell.
+def hides_narrow_parts(ignored: Bool[np.ndarray, "rows columns"], places: Float[np.ndarray, "n 2"]) -> bool:
+    """Whether the cells that a mask ignores hide something thin in front of what it leaves, such as a rod, which hides
+    too few points to tell.
 
     What it ignores between parts that it leaves, where they are close together (a morphological closing by a disc),
     may be background seen through a gap; no point of the object projects into it. Where points do, half as dense as in
     what the mask leaves or denser, something stood before the object. A square as wide as the disc holds MAX_IGNORED
-    of the points; what is larger holds more, and is told by them.
+    of the points; what is larger holds more, and is told by them. A thing thinner than two cells fills none.
     """
     left = ~ignored
     reach = math.sqrt(MAX_IGNORED * left.sum()) / 2
@@ -98,7 +102,7 @@ def hides_narrow_parts(ignored: Bool[np.ndarray, "h w"], places: Float[np.ndarra
     count, part = cv2.connectedComponents(narrow.astype(np.uint8))
     area, points = np.bincount(part.ravel(), minlength=count), np.bincount(_at(part, places), minlength=count)
     density = _at(left, places).sum() / left.sum()
-    hidden = (points >= MIN_HIDDEN) & (2 * points >= density * area)
+    hidden = (points >= MIN_HIDDEN) & (points >= MIN_DENSITY * density * area)
     return bool(hidden[1:].any())
 
 
@@ -106,8 +110,8 @@ def edge_share(photo: Path, mask: Path) -> float:
     """Of the border of a mask, the share where its photo differs more across the border than as far beyond it.
 
     An outline lies on edges of the photo. A border that is drawn loosely, such as a box, runs across ground that looks
-    the same on both sides, and either may differ more: half of it. Nothing within a cell of the border counts, nor
-    what is smaller.
+    the same on both sides; there half of it does. Compared are colours a cell inside the border, a cell outside and
+    three cells outside, so that an outline may be wrong by a cell.
     """
     ignored = read_ignored(mask)
     height, width = ignored.shape
@@ -135,6 +139,6 @@ def are_alike(ignored: Sequence[Float[np.ndarray, "rows columns"]]) -> bool:
     return all(np.minimum(*pair).sum() >= ALIKE * np.maximum(*pair).sum() for pair in together)
 
 
-def _distance(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """How far each pixel that is ``inside`` is from the nearest that is not, in pixels."""
+def _distance(inside: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
+    """How far each cell that is ``inside`` is from the nearest that is not, in cells."""
     return cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

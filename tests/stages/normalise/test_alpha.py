@@ -160,11 +160,11 @@ def test_loose_masks_on_plain_ground_only_ignore(outlined, progress: RecordedPro
 
 
 def rod(number: int, mask: np.ndarray) -> None:
-    mask[:, 197:203] = 0
+    mask[:, 199:206] = 0  # one cell wide
 
 
 def stick(number: int, mask: np.ndarray) -> None:
-    mask[190:196, : SIDE // 2] = 0
+    mask[196:204, : SIDE // 2] = 0
 
 
 @pytest.mark.parametrize("paint", [rod, stick])
@@ -174,12 +174,13 @@ def test_thin_things_before_an_object_are_not_cut_out(outlined, paint: Paint) ->
 
 
 def test_gaps_in_an_object_hide_nothing() -> None:
-    ignored = np.ones((200, 200), bool)
-    ignored[50:150, 50:96] = ignored[50:150, 104:150] = False
-    y, x = np.mgrid[50.5:150:4, 50.5:150:2].reshape(2, -1) / 200
+    ignored = np.ones((100, 100), bool)
+    ignored[25:75, 25:47] = ignored[25:75, 53:75] = False
+    y, x = np.mgrid[25.5:75:2, 25.5:75].reshape(2, -1) / 100
     places = np.stack([x, y], axis=1)
     assert hides_narrow_parts(ignored, places)
-    assert not hides_narrow_parts(ignored, places[(x < 0.485) | (x > 0.515)])  # outlines may be wrong by a pixel or two
+    assert not hides_narrow_parts(ignored, places[(x < 0.48) | (x > 0.52)])  # an outline may be wrong by a cell
+    assert not hides_narrow_parts(ignored, places[(x < 0.47) | (x > 0.53) | (y < 0.28)])
 
 
 def test_masks_of_test_photos_decide_nothing(outlined) -> None:
