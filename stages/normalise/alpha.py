@@ -147,7 +147,7 @@ class _Masks:
         """Whether most masks, as far as a few tell, ignore a good part of their photo on two of its opposite sides, and
         not all the same part, as around a thing."""
         ignored = [self.outlines[photo.name].ignored for photo in self.few]
-        return 2 * len(self.around) > len(ignored) and not are_alike([cells for cells in ignored if cells.any()])
+        return 2 * len(self.around) > len(ignored) and not are_alike([cells for cells in ignored if cells.max() > 0.5])
 
     def why_unknown(self, capture_type: CaptureType) -> str | None:
         """What speaks against masks that surround something cutting out an object, as far as a few tell."""

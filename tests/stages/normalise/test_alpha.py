@@ -15,7 +15,7 @@ from nerf.geometry.scene import Camera, Split
 from stages.io.files import write_png
 from stages.io.photos import Photo
 from stages.normalise.alpha import Alpha, MaskMeaning, find_alpha
-from stages.normalise.outlines import hides_narrow_parts
+from stages.normalise.outlines import hides_narrow_parts, read_outline
 from tests.camera_layouts import ball, ring, seen_by
 from tests.conftest import RecordedProgress
 
@@ -173,14 +173,23 @@ def test_thin_things_before_an_object_are_not_cut_out(outlined, paint: Paint) ->
     assert [number for number, mask in enumerate(found.masks) if mask is None] == [5]
 
 
+def test_cells_are_ignored_whole_whatever_the_size(tmp_path: Path) -> None:
+    for side in (400, 512, 600, 750):
+        write_png(tmp_path / "mask.png", np.uint8(255) * (np.arange(side * side).reshape(side, side) < side * side // 2))
+        model: Any = SimpleNamespace(cameras=[CAMERA])
+        image: Any = SimpleNamespace(camera=0, sfm_from_camera=np.eye(3, 4))
+        cells = read_outline(tmp_path / "mask.png", np.zeros((0, 3)), model, image).ignored
+        assert (cells[64:] == 1).all() and (cells[:64] < 1).all()
+
+
 def test_gaps_in_an_object_hide_nothing() -> None:
     ignored = np.ones((100, 100), bool)
-    ignored[25:75, 25:47] = ignored[25:75, 53:75] = False
+    ignored[25:75, 25:46] = ignored[25:75, 53:75] = False
     y, x = np.mgrid[25.5:75:2, 25.5:75].reshape(2, -1) / 100
     places = np.stack([x, y], axis=1)
     assert hides_narrow_parts(ignored, places)
-    assert not hides_narrow_parts(ignored, places[(x < 0.48) | (x > 0.52)])  # an outline may be wrong by a cell
-    assert not hides_narrow_parts(ignored, places[(x < 0.47) | (x > 0.53) | (y < 0.28)])
+    assert not hides_narrow_parts(ignored, places[(x < 0.46) | (x > 0.52)])  # an outline may be wrong by a cell
+    assert not hides_narrow_parts(ignored, places[(x < 0.46) | (x > 0.53) | (y < 0.28)])
 
 
 def test_masks_of_test_photos_decide_nothing(outlined) -> None:
