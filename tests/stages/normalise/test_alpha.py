@@ -164,7 +164,7 @@ def rod(number: int, mask: np.ndarray) -> None:
 
 
 def stick(number: int, mask: np.ndarray) -> None:
-    mask[196:204, : SIDE // 2] = 0
+    mask[199:206, :260] = 0
 
 
 @pytest.mark.parametrize("paint", [rod, stick])
