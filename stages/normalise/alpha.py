@@ -165,7 +165,11 @@ class _Masks:
         files = [(self.ingest / photo.file, self.ingest / str(photo.mask)) for photo in self.around]
         with ThreadPoolExecutor(loaders(photo for photo, _ in files)) as pool:
             loose = sum(share < MIN_EDGE for share in pool.map(edge_share, *zip(*files, strict=True)))
-        return "most of them also leave plain ground around the object" if 2 * loose > len(files) else None
+        return (
+            "most of their borders lie on no edge of the photo, as of a box around an object"
+            if 2 * loose > len(files)
+            else None
+        )
 
     def as_alpha(self, forced: bool, progress: Progress) -> Alpha:
         """The masks as alpha, but for those that do not follow an outline; ``forced``: all of them."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from stages.io.photos import Box, ends_within
 from stages.io.pixels import box_of, load_pixels, pillow
@@ -46,9 +46,7 @@ class Outline(NamedTuple):
         return self.box is not None and ends_within(self.box) and float(self.ignored.mean()) >= MIN_AREA
 
 
-def read_outline(
-    file: Path, points: Float[np.ndarray, "n 3"], model: SparseModel, image: SparseImage
-) -> Outline:
+def read_outline(file: Path, points: Float[np.ndarray, "n 3"], model: SparseModel, image: SparseImage) -> Outline:
     """The outline that a mask of ``image`` draws, as ``points`` in the frame of ``model`` judge it."""
     fine = read_ignored(file)
     scale = min(1.0, CELLS / max(fine.shape))
@@ -71,9 +69,7 @@ def read_ignored(file: Path) -> Bool[np.ndarray, "h w"]:
     return pixels[::step, ::step] == 0
 
 
-def _shown(
-    points: Float[np.ndarray, "n 3"], model: SparseModel, image: SparseImage
-) -> Float[np.ndarray, "shown 2"]:
+def _shown(points: Float[np.ndarray, "n 3"], model: SparseModel, image: SparseImage) -> Float[np.ndarray, "shown 2"]:
     """Where points lie in a photo, hidden ones too, as shares of its width and height; those outside are left out."""
     camera, pose = model.cameras[image.camera], image.sfm_from_camera
     places = project(camera, (points - pose[:, 3]) @ pose[:, :3]) / (camera.width, camera.height)

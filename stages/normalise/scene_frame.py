@@ -65,7 +65,7 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
     write_json(folder / "transforms.json", transforms(scene))
     masks = [view.mask or view.alpha for view in scene.views]
     if (without := masks.count(None)) and any(photo.mask for photo in photos):
-        them = f"{without} of {len(scene.views)} photos have none that ignores anything"
+        them = f"{without} of {len(scene.views)} have none (a white one uses all of its photo)"
         progress.note(
             "normalise.no-masks-exported",
             f"transforms.json names no masks: nerfstudio needs one for each photo, and {them}",
