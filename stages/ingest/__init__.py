@@ -14,6 +14,7 @@ from stages.contract import (
     StageConfig,
     StageResult,
     Workload,
+    reading_seconds,
 )
 from stages.ingest.sources import find_source
 from stages.io.files import write_json
@@ -21,6 +22,9 @@ from stages.io.photos import write_photos
 
 NOTES = "notes.json"
 MIN_FRAMES = 3  # of a video, as sfm needs
+# Of the time that its photo takes, a mask's: decoded, fitted and packed in 0.016 s a million pixels of a core (41 masks
+# of 12 megapixels), where a photo takes 0.022.
+MASK_SHARE = 0.4
 
 
 class Config(StageConfig):
@@ -47,8 +51,10 @@ class Config(StageConfig):
 
 
 def expected_seconds(config: Config, workload: Workload) -> float:
-    """Every photo is decoded once, by at most eight workers."""
-    return 0.5 + workload.photos.reading_seconds(min(workload.cores, 8))
+    """Every photo and every mask is decoded once, by at most eight workers."""
+    photos, workers = workload.photos, min(workload.cores, 8)
+    masks = MASK_SHARE * reading_seconds(photos.masked * photos.megapixels, workers)
+    return 0.5 + photos.reading_seconds(workers) + masks
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
@@ -78,7 +84,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 STAGE = Stage(
     name="ingest",
     inputs=(),
-    version=23,
+    version=24,
     exit_code=10,
     published=("photos.json", NOTES, "images", "masks", "opaque"),
     config=Config,

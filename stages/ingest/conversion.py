@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -82,7 +82,6 @@ class _Taken:
     clock_s: float | None = None
     time_s: float | None = None
     mask: _TakenMask | None = None
-    white_mask: bool = False
     digest: bytes = b""  # of size and pixels
     thumbnail: np.ndarray | None = None
     opaque: Box | None = None
@@ -133,8 +132,7 @@ def note_findings(photos: Sequence[Photo], converted: Converted, progress: Progr
     messages.note_findings(photos, progress)
     masks = [photo.mask for photo in converted.taken if photo.mask]
     turned, resized = sum(mask.turned for mask in masks), sum(mask.resized for mask in masks)
-    ignored = [mask.ignored for mask in masks] + [0.0 for photo in photos if photo.white_mask]
-    messages.note_masks(ignored, turned, resized, len(photos), progress)
+    messages.note_masks([mask.ignored for mask in masks], turned, resized, len(photos), progress)
 
 
 @contextmanager
@@ -162,6 +160,8 @@ def _take_all(
     stored = are_of_stored_pixels((file, masks[name]) for file in source.files if (name := source.name(file)) in masks)
     outcomes = _decode_all(source, masks, bool(stored), waiting, progress)
     taken = [outcome for outcome in outcomes if isinstance(outcome, _Taken)]
+    if not any(photo.mask and photo.mask.ignored for photo in taken):  # masks that are all white say nothing
+        taken = [replace(photo, mask=None) for photo in taken]
     if stored is None:
         notes += messages.taken_as_upright([photo.name for photo in taken if photo.mask and photo.mask.ambiguous])
     notes += messages.grey_masks([photo.name for photo in taken if photo.mask and photo.mask.grey])
@@ -248,7 +248,6 @@ def _take(file: Path, name: str, mask: Path | None, stored: bool, waiting: Path)
         exposure_ev=decoded.exposure_ev,
         clock_s=decoded.clock_s,
         mask=taken_mask,
-        white_mask=mask is not None and taken_mask is None,
         digest=hashlib.blake2b(str(pixels.shape).encode() + pixels.data, digest_size=16).digest(),
         thumbnail=thumbnail(pixels, taken_mask.thumbnail if taken_mask else None),
         opaque=opaque_box(pixels),
@@ -266,12 +265,10 @@ def _no_photo(kind: Panorama) -> DecodeError:
     return DecodeError("ingest.panorama", f"a panorama: {advice}")
 
 
-def _take_mask(file: Path, photo: CameraKey, stored: bool, waiting: Path) -> _TakenMask | None:
-    """The mask, left in ``waiting``; None where it ignores nothing. Raises DecodeError where it cannot be used."""
+def _take_mask(file: Path, photo: CameraKey, stored: bool, waiting: Path) -> _TakenMask:
+    """The mask, left in ``waiting``. Raises DecodeError where it cannot be used."""
     mask = read_mask(file, photo.width, photo.height, photo.orientation, stored)
     ignored = float((mask.pixels == 0).mean())
-    if not ignored:
-        return None
     write_png(waiting, mask.pixels)
     return _TakenMask(waiting, ignored, small(mask.pixels), mask.turned, mask.resized, mask.ambiguous, mask.grey)
 
@@ -361,7 +358,6 @@ def store(converted: Converted, folder: Path) -> list[Photo]:
                 sharpness=photo.sharpness,
                 relative_sharpness=relative[index],
                 mask=f"masks/{file}.png" if photo.mask else None,
-                white_mask=photo.white_mask,
                 near_duplicate_of=converted.duplicate_of.get(photo.name),
                 time_s=photo.time_s,
                 **photo.gps._asdict(),

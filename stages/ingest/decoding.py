@@ -29,7 +29,7 @@ from stages.ingest.orientation import QUARTER_TURNS, turned_size, upright
 from stages.ingest.panoramas import Panorama, panorama_kind
 from stages.ingest.video.tone_mapping import PHOTO_TRANSFERS, TONE_MAPPED, tone_mapped
 from stages.io.files import stand_in
-from stages.io.pixels import pillow
+from stages.io.pixels import colour_range, pillow
 
 MAX_PIXELS = 250_000_000
 _SRGB_TOLERANCE = 2  # of 255: profiles closer than this to sRGB are sRGB written by another hand
@@ -247,8 +247,7 @@ def is_black_and_white(pixels: np.ndarray) -> bool:
     """Whether (h, w, 3 or 4) uint8 has both black and white and next to nothing else, as masks do."""
     dark = bright = np.zeros(0, bool)
     for step in (16, 1):  # of most photos a few pixels tell
-        some = pixels[::step, ::step, :3]
-        darkest, brightest = some.min(axis=2), some.max(axis=2)
+        darkest, brightest = colour_range(pixels[::step, ::step])
         dark, bright = brightest <= NEARLY, darkest >= 255 - NEARLY
         if (dark | bright).mean() < MIN_BLACK_AND_WHITE or (brightest - darkest > NEARLY).any():
             return False

@@ -13,7 +13,7 @@ from stages.ingest.decoding import Decoded, DecodeError, decode, upright_size
 from stages.ingest.orientation import turned_size, upright
 from stages.io.files import write_png
 from stages.io.photos import Photo
-from stages.io.pixels import pillow
+from stages.io.pixels import colour_range, pillow
 
 USE_FROM = 128  # of 255: from here on a pixel counts as used
 NEARLY_BLACK, NEARLY_WHITE = 16, 239  # of 255: what compression leaves of black and white
@@ -97,7 +97,7 @@ def _light(decoded: Decoded, file: Path) -> tuple[np.ndarray, bool]:
     In a picture that is cut out the transparent parts are the mask. In labels, small numbers without losses, all but 0
     is used, as COLMAP and nerfstudio have it.
     """
-    light = decoded.pixels[..., :3].max(axis=2)
+    _, light = colour_range(decoded.pixels)
     if decoded.pixels.shape[2] == 4:
         alpha = decoded.pixels[..., 3]
         if _is_picture(light[alpha >= USE_FROM]):

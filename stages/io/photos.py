@@ -22,14 +22,14 @@ class Photo:
     there are too few.
 
     ``mask`` is a grey PNG of the photo's size, 255 where it is to be used and 0 where it is to be ignored; None: all of
-    it is used. ``white_mask``: a mask came with it, which is not kept because it ignores nothing. ``near_duplicate_of``
-    is the name of the photo that is nearly the same picture, which is used in its place. ``time_s`` is when a frame of
-    a video was taken, in seconds from its beginning, None for photos. The place is EXIF's, in degrees (north and east
-    positive) and metres above the sea, None where it tells none; so are ``exposure_ev``, in stops, and ``clock_s``,
-    when it was taken (stages/ingest/exif.py). ``opaque`` holds all that is more than half opaque, None without alpha.
-    ``has_alpha``: not nearly all of it is; ``opaque_mask`` is a mask that ignores the rest beside what ``mask`` does.
-    ``used_share`` and ``opaque_share`` are what the two masks leave of the pixels. ``orientation`` is EXIF's, which was
-    undone in the pixels.
+    it is used, and it came without a mask, or no mask of the set ignores anything. ``near_duplicate_of`` is the name of
+    the photo that is nearly the same picture, which is used in its place. ``time_s`` is when a frame of a video was
+    taken, in seconds from its beginning, None for photos. The place is EXIF's, in degrees (north and east positive) and
+    metres above the sea, None where it tells none; so are ``exposure_ev``, in stops, and ``clock_s``, when it was taken
+    (stages/ingest/exif.py). ``opaque`` holds all that is more than half opaque, None without alpha. ``has_alpha``: not
+    nearly all of it is; ``opaque_mask`` is a mask that ignores the rest beside what ``mask`` does. ``used_share`` and
+    ``opaque_share`` are what the two masks leave of the pixels. ``orientation`` is EXIF's, which was undone in the
+    pixels.
     """
 
     name: str  # the user's own file name, relative to the photo folder
@@ -43,7 +43,6 @@ class Photo:
     sharpness: float
     relative_sharpness: float | None = None
     mask: str | None = None  # "masks/….png", relative to ingest's folder
-    white_mask: bool = False
     near_duplicate_of: str | None = None
     time_s: float | None = None
     latitude: float | None = None
@@ -56,11 +55,6 @@ class Photo:
     opaque_share: float = 1.0
     used_share: float = 1.0
     orientation: int = 1
-
-    @property
-    def has_mask(self) -> bool:
-        """Whether it came with a mask."""
-        return self.mask is not None or self.white_mask
 
     @property
     def image_name(self) -> str:

@@ -3,40 +3,35 @@
 A mask says which pixels are to be ignored, and no more. Masks drawn around a thing so leave open what is beside it:
 training may put anything there, and does. The sparse points tell masks that follow an outline from those that hide
 something, such as people who pass by. From wherever it was taken, a photo shows all points of a thing within the
-thing's outline, those on its back, too; but points of what is hidden lie among the ignored pixels.
+thing's outline, those on its back, too; but points of what is hidden lie among the ignored pixels. Where a mask leaves
+plain ground around the thing there are no points; there its border lies on no edge of the photo.
+
+Training photos decide, the masks of test photos have no say.
 """
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
-import cv2
 import numpy as np
-from jaxtyping import Float
 
 from nerf.geometry.normalisation import Normalisation
 from nerf.geometry.region_of_interest import CaptureType
+from nerf.geometry.scene import Split
 from stages.contract import Progress, listed
 from stages.io.amounts import counted
 from stages.io.photos import Box, Photo, ends_within, spread
-from stages.io.pixels import box_of, loaders, pillow
-from stages.io.sparse_model import SparseImage, SparseModel
-from stages.sfm.colmap.cameras import project
+from stages.io.pixels import loaders
+from stages.io.sparse_model import SparseModel
+from stages.normalise.outlines import MIN_EDGE, Outline, are_alike, edge_share, read_outline
 
 MaskMeaning = Literal["cut-out", "ignore"]
+T = TypeVar("T")
 
-CELLS = 128  # along the longer side of a photo: an outline may be wrong by so much of it
-SAMPLES = 4  # along a side of a cell
 FEW = 24  # masks, evenly spread, that decide for all
-MIN_AREA = 0.25  # that a mask ignores around an object; a wire or a thin border is less
-ALIKE = 0.99  # of what one of two masks leaves, that both do: of a lens, a rig or a border
 MIN_PHOTOS = 3  # that see a point for it to count
-MIN_POINTS, MAX_POINTS = 20, 4000  # that lie in a photo for them to tell; that are looked at
-# Of the points that lie in a photo, that a mask which follows an outline may ignore. Masks of a carved stone ignored
-# 0.1 % of them (median of 145 photos) and 2.5 % (95 in 100), the wrong one among them 49 %; of two statues 2.2 % at
-# most.
-MAX_IGNORED = 0.03
+MAX_POINTS = 4000  # that are looked at
 
 
 class Alpha(NamedTuple):
@@ -52,20 +47,22 @@ def find_alpha(
     photos: Sequence[Photo],
     model: SparseModel,
     order: Sequence[int],
+    split: Sequence[Split],
     capture_type: CaptureType,
     meaning: MaskMeaning | None,
     progress: Progress,
 ) -> Alpha | None:
     """The photos' own alpha, else their masks, where these cut out an object or are said to (``meaning``); None where
-    nothing says what is background. Photo i is image ``order[i]`` of the model."""
-    if _has_alpha(photos, progress, tracked=len(model.view) > 0):
+    nothing says what is background. Photo i is image ``order[i]`` of the model; training photos alone decide."""
+    train = _of_training(photos, split)
+    if _has_alpha(photos, train, progress, tracked=len(model.view) > 0):
         return Alpha([photo.opaque for photo in photos], [None] * len(photos))
     if meaning == "ignore":
         return None
-    masks = _Masks(ingest, photos, model, order)
+    masks = _Masks(ingest, photos, model, order, split)
     if meaning == "cut-out":
-        if not masks.photos or any(photo.has_alpha for photo in photos):
-            why = "some photos have alpha" if masks.photos else "no mask ignores anything"
+        if not masks.few or any(photo.has_alpha for photo in train):
+            why = "some photos have alpha" if masks.few else "no mask ignores anything"
             progress.note("normalise.masks-not-used", f"--normalise.masks cut-out changes nothing: {why}")
             return None
         return masks.as_alpha(forced=True, progress=progress)
@@ -94,7 +91,7 @@ def alpha_or_none(
         return None
     if of_masks:
         others = [photo.name for photo, mask in zip(photos, alpha.masks, strict=True) if photo.mask and not mask]
-        without = [photo.name for photo in photos if not photo.has_mask]
+        without = [photo.name for photo in photos if not photo.mask]
         but = f"; masks that also hide parts of it only ignore ({listed(others, 3)})" if others else ""
         but += f"; photos without a mask count as opaque ({listed(without, 3)})" if without else ""
         progress.note(
@@ -104,21 +101,23 @@ def alpha_or_none(
     return alpha
 
 
-def _has_alpha(photos: Sequence[Photo], progress: Progress, tracked: bool) -> bool:
-    """Whether the photos may say what is background: most have transparent parts, and most of these show what is opaque
-    from one of its sides to the other, as one sees a thing. Outdoors without a sky one does not, nor in photos with
-    empty corners. Where nothing is tracked, which would tell, all alpha counts. Exceptions are said."""
+def _has_alpha(photos: Sequence[Photo], train: Sequence[Photo], progress: Progress, tracked: bool) -> bool:
+    """Whether the photos may say what is background: most of those to train on have transparent parts, and most of
+    these show what is opaque from one of its sides to the other, as one sees a thing. Outdoors without a sky one does
+    not, nor in photos with empty corners. Where nothing is tracked, which would tell, all alpha counts. Exceptions are
+    said."""
+    with_alpha = [photo for photo in train if photo.has_alpha]
+    framing = sum(not tracked or ends_within(photo.opaque) for photo in with_alpha)
+    most = 2 * len(with_alpha) > len(train)
+    has_alpha = most and 2 * framing > len(with_alpha)
     transparent = sum(photo.has_alpha for photo in photos)
-    framing = sum(photo.has_alpha and ends_within(photo.opaque) for photo in photos) if tracked else transparent
-    opaque = len(photos) - transparent
-    has_alpha = transparent > opaque and 2 * framing > transparent
-    if has_alpha and opaque:
+    if has_alpha and transparent < len(photos):
         progress.note(
             "normalise.opaque-photos",
-            f"{opaque} of {len(photos)} photos have no transparent parts and count as opaque",
+            f"{len(photos) - transparent} of {len(photos)} photos have no transparent parts and count as opaque",
         )
     elif transparent and not has_alpha:
-        why = "most photos have none" if transparent <= opaque else "few photos show the opaque object whole"
+        why = "few photos show the opaque object whole" if most else "most photos have none"
         progress.note(
             "normalise.alpha-ignored",
             f"transparent parts of {transparent} of {len(photos)} photos are ignored like masked ones: {why}",
@@ -127,48 +126,56 @@ def _has_alpha(photos: Sequence[Photo], progress: Progress, tracked: bool) -> bo
 
 
 class _Masks:
-    """The masks of ``photos`` that ignore something, and whether they follow the outline of what the points show."""
+    """The masks of ``photos``, and what those of the training photos say together."""
 
-    def __init__(self, ingest: Path, photos: Sequence[Photo], model: SparseModel, order: Sequence[int]) -> None:
+    def __init__(
+        self, ingest: Path, photos: Sequence[Photo], model: SparseModel, order: Sequence[int], split: Sequence[Split]
+    ) -> None:
         self.ingest, self.all, self.model = ingest, photos, model
         self.image = {photo.name: model.images[i] for photo, i in zip(photos, order, strict=True)}
-        self.photos = [photo for photo in photos if photo.mask]
-        seen = np.bincount(model.point, minlength=len(model.xyz)) if len(model.point) else np.zeros(len(model.xyz))
+        self.train = _of_training(photos, split)
+        seen = np.bincount(model.point[np.isin(model.view, _of_training(order, split))], minlength=len(model.xyz))
         firm = model.xyz[seen >= MIN_PHOTOS]
         self.points = firm[:: -(-len(firm) // MAX_POINTS) or 1]
-        self.looked_at = dict[str, _Mask]()  # by the names of their photos
-        few = [self.photos[i] for i in spread(len(self.photos), min(len(self.photos), FEW))]
-        self._look_at(few, lambda done: None)
-        self.few = [*self.looked_at.values()]
+        self.outlines = dict[str, Outline]()  # by the names of their photos
+        masked = [photo for photo in self.train if photo.mask]
+        self.few = [masked[i] for i in spread(len(masked), min(len(masked), FEW))]
+        self._look_at(self.few, lambda done: None)
+        self.around = [photo for photo in self.few if self.outlines[photo.name].surrounds]
 
     def surround_something(self) -> bool:
         """Whether most masks, as far as a few tell, ignore a good part of their photo on two of its opposite sides, and
         not all the same part, as around a thing."""
-        around = sum(_is_around_something(mask) for mask in self.few) * len(self.photos)
-        most = 2 * around > sum(photo.has_mask for photo in self.all) * len(self.few)
-        return most and not _are_alike([mask.ignored for mask in self.few])
+        ignored = [self.outlines[photo.name].ignored for photo in self.few]
+        return 2 * len(self.around) > len(ignored) and not are_alike([cells for cells in ignored if cells.max() > 0.5])
 
     def why_unknown(self, capture_type: CaptureType) -> str | None:
         """What speaks against masks that surround something cutting out an object, as far as a few tell."""
-        if any(photo.has_alpha for photo in self.all):
+        if any(photo.has_alpha for photo in self.train):
             return "some photos have alpha"
-        if without := sum(not photo.has_mask for photo in self.all):
-            return f"{without} of {counted(len(self.all), 'photo')} {'has' if without == 1 else 'have'} no mask"
+        if without := sum(not photo.mask for photo in self.train):
+            have = "has" if without == 1 else "have"
+            return f"{without} of {counted(len(self.train), 'training photo')} {have} no mask"
         if capture_type != "object-centric":
             return "the photos were not taken around an object"
         if not len(self.points):
             return "no points tell whether they hide parts of the object"
-        follow = sum(mask.follows and _is_around_something(mask) for mask in self.few)
-        return None if 2 * follow > len(self.few) else "most of them also hide tracked points"
+        if 2 * sum(self.outlines[photo.name].follows for photo in self.around) <= len(self.around):
+            return "most of them also hide tracked points"
+        files = [(self.ingest / photo.file, self.ingest / str(photo.mask)) for photo in self.around]
+        with ThreadPoolExecutor(loaders(photo for photo, _ in files)) as pool:
+            loose = sum(share < MIN_EDGE for share in pool.map(edge_share, *zip(*files, strict=True)))
+        return (
+            "most of their borders lie on no edge of the photo, as of a box around an object"
+            if 2 * loose > len(files)
+            else None
+        )
 
     def as_alpha(self, forced: bool, progress: Progress) -> Alpha:
         """The masks as alpha, but for those that do not follow an outline; ``forced``: all of them."""
-
-        def report(done: float) -> None:
-            progress.update("looking at the masks", done)
-
-        self._look_at(self.photos, report)
-        boxes = {name: mask.box for name, mask in self.looked_at.items() if forced or mask.follows}
+        masked = [photo for photo in self.all if photo.mask]
+        self._look_at(masked, lambda done: progress.update("looking at the masks", done))
+        boxes = {name: one.box for name, one in self.outlines.items() if forced or one.follows}
         return Alpha(
             [boxes.get(photo.name) for photo in self.all],
             [photo.mask if photo.name in boxes else None for photo in self.all],
@@ -176,53 +183,18 @@ class _Masks:
 
     def _look_at(self, photos: Sequence[Photo], report: Callable[[float], None]) -> None:
         """Look at the masks of ``photos`` that have not been looked at."""
-        rest = [photo for photo in photos if photo.name not in self.looked_at]
-        files = [self.ingest / photo.mask for photo in rest if photo.mask]
+        rest = [photo for photo in photos if photo.name not in self.outlines]
+        files = [self.ingest / str(photo.mask) for photo in rest]
+
+        def outline(photo: Photo, file: Path) -> Outline:
+            return read_outline(file, self.points, self.model, self.image[photo.name])
+
         with ThreadPoolExecutor(loaders(files)) as pool:
-            for photo, ignored in zip(rest, pool.map(_ignored_share, files), strict=True):
-                share = self._ignored_points(self.image[photo.name], ignored)
-                self.looked_at[photo.name] = _Mask(ignored, box_of(ignored < 0.5), share <= MAX_IGNORED)
-                report(len(self.looked_at) / len(photos))
-
-    def _ignored_points(self, image: SparseImage, ignored: Float[np.ndarray, "rows columns"]) -> float:
-        """Of the points that lie in a photo, hidden ones too, the share in cells that its mask ignores whole; 1 where
-        too few lie there."""
-        camera, pose = self.model.cameras[image.camera], image.sfm_from_camera
-        local = (self.points - pose[:, 3]) @ pose[:, :3]
-        pixels, size = project(camera, local), np.array([camera.width, camera.height])
-        inside = ((pixels >= 0) & (pixels < size)).all(axis=1)  # NaN is not
-        if inside.sum() < MIN_POINTS:
-            return 1.0
-        rows, columns = ignored.shape
-        column, row = np.minimum((pixels[inside] / size * [columns, rows]).astype(int), [columns - 1, rows - 1]).T
-        return float((ignored[row, column] == 1).mean())
+            for photo, one in zip(rest, pool.map(outline, rest, files), strict=True):
+                self.outlines[photo.name] = one
+                report(len(self.outlines) / len(photos))
 
 
-class _Mask(NamedTuple):
-    """How much it ``ignored`` of each cell, what holds the rest, and whether it ``follows`` an outline."""
-
-    ignored: Float[np.ndarray, "rows columns"]
-    box: Box | None
-    follows: bool
-
-
-def _is_around_something(mask: _Mask) -> bool:
-    return mask.box is not None and ends_within(mask.box) and float(mask.ignored.mean()) >= MIN_AREA
-
-
-def _are_alike(ignored: Sequence[Float[np.ndarray, "rows columns"]]) -> bool:
-    """Whether all those of a shape leave nearly the same."""
-    first = {one.shape: 1 - one for one in reversed(ignored)}
-    together = [(1 - one, first[one.shape]) for one in ignored]
-    return all(np.minimum(*pair).sum() >= ALIKE * np.maximum(*pair).sum() for pair in together)
-
-
-def _ignored_share(file: Path) -> Float[np.ndarray, "rows columns"]:
-    """How much a mask ignores of each of CELLS cells along its longer side, by some of their pixels."""
-    with pillow().open(file) as image:
-        pixels = np.asarray(image)
-    step = max(1, max(pixels.shape) // (SAMPLES * CELLS))
-    ignored = (pixels[::step, ::step] == 0).astype(np.float32)
-    scale = min(1.0, CELLS / max(ignored.shape))
-    width, height = (max(1, round(side * scale)) for side in ignored.shape[::-1])
-    return cv2.resize(ignored, (width, height), interpolation=cv2.INTER_AREA)
+def _of_training(items: Sequence[T], split: Sequence[Split]) -> list[T]:
+    """Those of the training photos."""
+    return [item for item, part in zip(items, split, strict=True) if part == "train"]

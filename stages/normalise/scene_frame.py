@@ -46,10 +46,9 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
     )
     photos, order = [photo for photo, _ in posed], [i for _, i in posed]
     sfm = _reconstruction(model, order)
-    alpha = find_alpha(inputs["ingest"], photos, model, order, find_capture_type(sfm), config.masks, progress)
     registration = read_json(inputs["sfm"] / "registration.json")
-    official = registration["test_files"]
-    split = split_photos(photos, config.test_every, official)
+    split = _split(photos, config, registration["test_files"])
+    alpha = find_alpha(inputs["ingest"], photos, model, order, split, find_capture_type(sfm), config.masks, progress)
     # What is opaque in a test photo decides nothing.
     if alpha is not None:
         boxes = [box if part == "train" else None for box, part in zip(alpha.opaque, split, strict=True)]
@@ -59,13 +58,6 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
     except ValueError as error:
         hint = "Take photos from different places, or give --normalise.roi."
         raise StageError("normalise.no-scale", "the scene has no scale", str(error), hint) from error
-    if split.count("train") < MIN_TRAINING_VIEWS:
-        raise StageError(
-            "normalise.few-training-photos",
-            f"only {split.count('train')} of {len(split)} photos remain for training",
-            "the others are held out as test photos",
-            f"Add training photos, or {'change the given split' if official else 'raise --normalise.test-every'}.",
-        )
     if alpha is not None:
         alpha = alpha_or_none(alpha, photos, found, config.roi is not None, progress)
     scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split, alpha)
@@ -74,7 +66,7 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
     write_json(folder / "transforms.json", transforms(scene))
     masks = [view.mask or view.alpha for view in scene.views]
     if (without := masks.count(None)) and any(photo.mask for photo in photos):
-        them = f"{without} of {len(scene.views)} photos have none that ignores anything"
+        them = f"{without} of {len(scene.views)} have none (a white one uses all of its photo)"
         progress.note(
             "normalise.no-masks-exported",
             f"transforms.json names no masks: nerfstudio needs one for each photo, and {them}",
@@ -101,6 +93,19 @@ def _check(config: "Config", views: int) -> None:
             "the half-side of the region, the fourth number, must be above 0",
             "Give x y z half-side in the frame of output/transforms.json.",
         )
+
+
+def _split(photos: list[Photo], config: "Config", official: list[str] | None) -> list[Split]:
+    """The split of the photos. Raises StageError where it leaves too few to train on."""
+    split = split_photos(photos, config.test_every, official)
+    if split.count("train") < MIN_TRAINING_VIEWS:
+        raise StageError(
+            "normalise.few-training-photos",
+            f"only {split.count('train')} of {len(split)} photos remain for training",
+            "the others are held out as test photos",
+            f"Add training photos, or {'change the given split' if official else 'raise --normalise.test-every'}.",
+        )
+    return split
 
 
 def _reconstruction(model: SparseModel, order: list[int]) -> Reconstruction:

@@ -60,18 +60,19 @@ def test_photos_are_counted_and_measured_without_decoding(photos: Path) -> None:
     assert photos_of(settings(photos / "gone")) is None
 
 
-def test_masks_are_counted_and_take_normalise_time(photos: Path) -> None:
+def test_masks_are_counted_and_take_time(photos: Path) -> None:
     (photos / "masks").mkdir()
     for name in ("0.png", "3.png.png", "stranger.png"):
         Image.new("L", (200, 150)).save(photos / "masks" / name)
     assert photos_of(settings(photos)) == Photos(5, 0.03, masked=2)
 
-    def seconds(masked: int, masks: str | None = None) -> float:
-        found = expected(settings(photos, normalise={"masks": masks}), Photos(145, 12.0, masked))["normalise"]
+    def seconds(masked: int, masks: str | None = None, stage: str = "normalise") -> float:
+        found = expected(settings(photos, normalise={"masks": masks}), Photos(145, 12.0, masked))[stage]
         assert found is not None
         return found
 
     assert seconds(0) == seconds(145, "ignore") < seconds(24) < 2 < seconds(145) < 8
+    assert 1.2 * seconds(0, stage="ingest") < seconds(145, stage="ingest") < 1.8 * seconds(0, stage="ingest")
     (photos / "empty").mkdir()
     assert photos_of(settings(photos / "empty")) is None
 

@@ -271,10 +271,9 @@ def test_masks_go_with_their_photos(tmp_path: Path, progress: Any) -> None:
     result = ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
     photos = read_photos(tmp_path / "out")
     assert result.outputs == ("images", "photos.json", "masks")
-    assert [photo.mask is not None for photo in photos] == [True, False, False, False, True, True]
-    assert [photo.has_mask for photo in photos] == [True, False, True, False, True, True]
+    assert [photo.mask is not None for photo in photos] == [True, False, True, False, True, True]
     assert [photo.used_share for photo in photos] == [0.75, 1, 1, 1, 0.5, 0.5]
-    for photo, columns in zip([photos[0], photos[4], photos[5]], (8, 16, 16), strict=True):
+    for photo, columns in zip([photos[0], photos[2], photos[4], photos[5]], (8, 0, 16, 16), strict=True):
         file = f"masks/{photo.file.removeprefix('images/')}.png"
         mask = np.asarray(Image.open(tmp_path / "out" / file))
         assert photo.mask == file
@@ -282,6 +281,14 @@ def test_masks_go_with_their_photos(tmp_path: Path, progress: Any) -> None:
     assert progress.codes == ["ingest.stray-masks", "ingest.masks"]
     assert progress.names("ingest.stray-masks", "masks/stranger.png")
     assert progress.names("ingest.masks", "4 of 6 photos", "31%", "1 are turned", "1 are resized")
+
+
+def test_masks_that_are_all_white_say_nothing(tmp_path: Path, progress: Any) -> None:
+    folder = put(tmp_path / "in", "a.png", "b.png")
+    for name in ("masks/a.png", "masks/b.png"):
+        mask_for(folder, name, 0)
+    assert ingest.run(Config(photos=folder), {}, tmp_path / "out", progress).outputs == ("images", "photos.json")
+    assert not any(photo.mask for photo in read_photos(tmp_path / "out")) and progress.codes == []
 
 
 def test_a_photo_whose_mask_cannot_be_used_is_refused(tmp_path: Path, progress: Any) -> None:

@@ -132,14 +132,21 @@ def test_alpha_makes_the_background_known(inputs, progress) -> None:
 
 
 @pytest.mark.parametrize(
-    ("transparent", "has_alpha", "code"), [(16, True, "opaque-photos"), (1, False, "alpha-ignored")]
+    ("transparent", "has_alpha", "code", "named"),
+    [
+        (16, True, "opaque-photos", "1 of 17"),
+        (1, False, "alpha-ignored", "1 of 17"),
+        (9, False, "alpha-ignored", "9 of 17"),  # of the training photos they are half
+    ],
 )
-def test_most_photos_decide_on_alpha_and_exceptions_are_named(inputs, progress, transparent, has_alpha, code) -> None:
+def test_most_training_photos_decide_on_alpha_and_exceptions_are_named(
+    inputs, progress, transparent, has_alpha, code, named
+) -> None:
     folders = inputs(transparent=transparent)
     run(folders, progress)
     scene = read_scene(folders["normalise"])
     assert (scene.has_alpha, scene.bounded, progress.codes) == (has_alpha, has_alpha, [f"normalise.{code}"])
-    assert progress.names(f"normalise.{code}", "1 of 17 photos")
+    assert progress.names(f"normalise.{code}", named)
     assert [view.mask for view in scene.views] == [
         f"opaque/{i:02d}.png" if not has_alpha and i < transparent else None for i in range(17)
     ]
@@ -179,7 +186,8 @@ def test_masks_around_an_object_become_its_alpha(inputs, progress) -> None:
     for i, photo in enumerate(masked):
         mask = np.zeros((400, 400), np.uint8)
         cv2.circle(mask, (200, 200), 125 + i, 255, -1)
-        write_png(folders["ingest"] / str(photo.mask), mask)
+        write_png(folders["ingest"] / photo.file, np.repeat(mask[..., None], 3, axis=2))
+        write_png(folders["ingest"] / str(photo.mask), mask if i < 16 else np.full_like(mask, 255))
     write_photos(folders["ingest"], masked, [], {})
     run(folders, progress)
     scene = read_scene(folders["normalise"])
