@@ -121,7 +121,6 @@ def _reconstruct(
         test_files=None,
         **{name: found[name] for name in FACTS},
     )
-    _remove_intermediate(folder)
     complete = all(image["registered"] for image in images)
     return registration, "" if complete else _skipped_for_time(found["skipped_for_time"])
 
@@ -215,7 +214,8 @@ def _are_sound(strategies: Path) -> bool:
 
 
 def _remove_intermediate(folder: Path) -> None:
-    """Remove what only an interrupted run needs: the log first, for without the rest it would mislead."""
+    """Remove what an interrupted run left: the log first, for without the rest it would mislead. Of a finished run that
+    is the runner's to do, once its manifest is written: until then a kill would lose all of it."""
     (folder / "strategies" / LOG).unlink(missing_ok=True)
     shutil.rmtree(folder / "strategies", ignore_errors=True)
     for database in folder.glob("matches-*"):

@@ -207,8 +207,7 @@ def expected_seconds(strategy: Strategy, outcomes: Sequence[Outcome], rematched:
     Mapping takes as long as it did at most; it is over sooner where nothing more is found. New features are extracted
     from four times the pixels and are twice as many, which is four times the matching and twice the mapping.
     """
-    first = outcomes[0].seconds
-    mapping = max(one.seconds["mapping"] for one in outcomes)
+    first, mapping = outcomes[0].seconds, mapping_seconds(outcomes)
     relaxed = RELAXED_COST * rematched * first["matching"]
     if strategy.matches == "missing":
         return relaxed + ADDING * mapping
@@ -218,10 +217,16 @@ def expected_seconds(strategy: Strategy, outcomes: Sequence[Outcome], rematched:
     return again[strategy.matches] + mapping
 
 
+def mapping_seconds(outcomes: Sequence[Outcome]) -> float:
+    """How long incremental mapping took at most."""
+    incremental = {strategy.name for strategy in STRATEGIES if strategy.mapping}
+    return max(one.seconds["mapping"] for one in outcomes if one.name in incremental)
+
+
 def exceeds_time(expected: float, outcomes: Sequence[Outcome], left: float) -> bool:
     """Whether a strategy would not leave the time for the final bundle adjustment of its model, or of the best so
     far."""
-    return expected + FINAL_ADJUSTMENT_FACTOR * max(one.seconds["mapping"] for one in outcomes) > left
+    return expected + FINAL_ADJUSTMENT_FACTOR * mapping_seconds(outcomes) > left
 
 
 class Situation(NamedTuple):

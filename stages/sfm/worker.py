@@ -149,7 +149,8 @@ def _try_strategies(state: JobState) -> None:
             why = f"{len(missing)} of {len(state.photos)} photos {are} unregistered"
             if _is_misfit(state):
                 why = "the cameras do not fit the verified matches"
-            duration = f" (about {rough_duration(takes)})" if takes >= MIN_SECONDS_SAID else ""
+            more = " more" if state.job.seconds is None else ""  # than was expected of the run; else they are given
+            duration = f" (about {rough_duration(takes)}{more})" if takes >= MIN_SECONDS_SAID else ""
             state.send(note=Note("sfm.strategy", f"{why}: {strategy.description}{duration}"))
             _try(strategy, missing, state)
     for why, descriptions in unsaid.items():

@@ -16,6 +16,7 @@ from stages.sfm.retry_strategies import (
     abandon,
     exceeds_time,
     expected_seconds,
+    mapping_seconds,
     reason_against,
 )
 
@@ -95,6 +96,11 @@ def test_earlier_strategies_predict_the_seconds_of_the_next(name: str, seconds: 
 def test_a_strategy_must_leave_time_for_the_final_bundle_adjustment() -> None:
     assert exceeds_time(50.0, TIMED, 50.0 + 2 * 30 - 1)
     assert not exceeds_time(50.0, TIMED, 50.0 + 2 * 30 + 1)
+
+
+def test_global_mapping_does_not_predict_incremental_mapping() -> None:
+    hung = Outcome("global mapping", "x.db", seconds={"mapping": 500.0})
+    assert mapping_seconds([*TIMED, hung]) == 30
 
 
 def test_strategies_that_ended_the_worker_are_remembered(tmp_path: Path) -> None:

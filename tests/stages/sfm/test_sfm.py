@@ -142,7 +142,6 @@ def test_the_account_says_what_became_of_each_photo(reconstructed: Path) -> None
     assert account["reprojection_px"] == pytest.approx(model.error_px.mean())
     assert [image["observations"] for image in account["images"]] == np.bincount(model.view).tolist()
     assert all(image["keypoints"] > image["observations"] > 20 for image in account["images"])
-    assert sorted(path.name for path in reconstructed.iterdir()) == ["registration.json", "sfm.log", "sparse"]
 
 
 PROGRAM = """
@@ -395,7 +394,6 @@ def test_a_strategy_that_ended_the_worker_is_skipped(
     assert progress.names("sfm.strategy-failed-before", became, "registering them in the model")
     tried = {row["strategy"]: row["skipped"] for row in read_json(tmp_path / "sfm/registration.json")["strategies"]}
     assert became in tried["missing photos"]
-    assert not (tmp_path / "sfm/strategies").exists()
 
 
 def test_a_strategy_for_which_no_time_is_left_is_skipped(
