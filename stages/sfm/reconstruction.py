@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from filelock import Timeout
 
 from nerf.geometry.georeference import georeference
 from stages.contract import Note, Progress, StageError, listed
@@ -18,6 +19,7 @@ from stages.sfm.colmap.known_cameras import known_cameras
 from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.conventions import PoseConvention
 from stages.sfm.imported.import_poses import import_poses
+from stages.sfm.job import worker_lock
 from stages.sfm.pairs.pair_selection import capture_priors
 from stages.sfm.pairs.quality_level import GivenOptions, check_matcher, chosen
 from stages.sfm.registration import (
@@ -67,6 +69,7 @@ def find_cameras(config: "Config", ingest: Path, folder: Path, progress: Progres
     Raises StageError where no usable model comes out.
     """
     photos, matched = _photos(ingest)
+    _wait_for_worker(folder, progress)
     if config.cameras is not None:
         convention = PoseConvention(config.pose_direction, config.camera_axes)
         limits = config.adjust_poses, config.max_seconds
@@ -184,6 +187,17 @@ def _check_camera(config: "Config", photos: Sequence[Photo], progress: Progress)
 
 
 # --- what an interrupted run left
+
+
+def _wait_for_worker(folder: Path, progress: Progress) -> None:
+    """Wait for the worker process of a run that was killed, which may not have ended yet."""
+    lock = worker_lock(folder)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        progress.update("waiting for the worker process of a killed run to end")
+        lock.acquire()
+    lock.release()
 
 
 def _database(folder: Path, names: Sequence[str], progress: Progress) -> Path:

@@ -24,7 +24,7 @@ from stages.sfm.colmap.diagnosis import find_conflict, links, supports
 from stages.sfm.colmap.model_check import check_model, facts, reasons
 from stages.sfm.colmap.models import load_native, turned_upright, write_native
 from stages.sfm.colmap.repair import deregister
-from stages.sfm.job import Job, JobState, Send, end_with_parent
+from stages.sfm.job import Job, JobState, Send, end_with_parent, worker_lock
 from stages.sfm.matching import capture_sequence, match_photos, relaxed_pairs
 from stages.sfm.retry_strategies import (
     MIN_LONG_FOCAL,
@@ -53,7 +53,7 @@ def main() -> None:
         channel.write(json.dumps(message) + "\n")
 
     try:
-        with cluster.joined(job.cluster):
+        with worker_lock(Path(job.folder)), cluster.joined(job.cluster):
             send(result=reconstruct(job, send))
     except StageError as error:
         send(error=[error.code, error.what, error.why, error.hint])
