@@ -25,8 +25,9 @@ from stages.sfm.colmap.model_check import check_model, facts, reasons
 from stages.sfm.colmap.models import load_native, turned_upright, write_native
 from stages.sfm.colmap.repair import deregister
 from stages.sfm.job import Job, JobState, Send, end_with_parent, worker_lock
-from stages.sfm.matching import capture_sequence, match_photos, relaxed_pairs
+from stages.sfm.matching import capture_sequence, enlargement, match_photos, relaxed_pairs
 from stages.sfm.retry_strategies import (
+    INDEXED_COST,
     MIN_LONG_FOCAL,
     STRATEGIES,
     TIME_GIVEN,
@@ -205,11 +206,14 @@ def _why_infeasible(strategy: Strategy, expected: float, state: JobState) -> Ski
 
 def _expected(strategy: Strategy, missing: list[int], state: JobState) -> float:
     """How many seconds the strategy will take."""
-    rematched = 0.0
+    rematched, enlarged = 0.0, 1.0
     if strategy.matches in ("missing", "relaxed"):
         matched = len(matched_pairs(state.database))
         rematched = relaxed_pairs(strategy, len(missing), matched, state) / max(1, matched)
-    return expected_seconds(strategy, state.log.outcomes, rematched)
+    elif strategy.matches == "more features":
+        rematched = INDEXED_COST if state.job.matcher == "exhaustive" else 1.0
+        enlarged = enlargement(state)
+    return expected_seconds(strategy, state.log.outcomes, rematched, enlarged)
 
 
 def _try(strategy: Strategy, missing: list[int], state: JobState) -> None:
