@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipeline.engine.manifests import Manifest
 from pipeline.engine.stage_list import usual
 from pipeline.engine.workspace import Workspace
 from stages.sfm import worker_process
@@ -110,7 +111,11 @@ def adjust_for_minutes() -> None:
 
 def die_before_the_manifest() -> None:
     """In the program: it is killed with all results of a stage written, and no manifest."""
-    Workspace.finish = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+
+    def die(self: Workspace, partial: Path, folder: Path, manifest: Manifest) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    Workspace.finish = die
 
 
 def test_killed_while_photos_are_matched(photos_and_a_stranger: Path, tmp_path: Path):
