@@ -16,7 +16,7 @@ from stages.sfm.colmap.database.images import adopt_cameras
 from stages.sfm.colmap.database.matching import best_linked
 from stages.sfm.colmap.database.thinning import thin_matches
 from stages.sfm.colmap.joining import Piece, join_pieces
-from stages.sfm.colmap.mappers import incremental_options, map_globally, map_incrementally
+from stages.sfm.colmap.mappers import incremental_options, map_incrementally
 from stages.sfm.colmap.model_check import (
     Candidate,
     agreeing_pairs,
@@ -38,6 +38,7 @@ from stages.sfm.retry_strategies import (
     STRATEGIES,
     MappingOptions,
     Strategy,
+    mapping_seconds,
 )
 
 CALIBRATING_PHOTOS = 40
@@ -93,8 +94,7 @@ def run_mapping(strategy: Strategy, database: Path, state: JobState) -> Mapped |
     """Map these matches, and check the best model; None if there is none."""
     state.begin("mapping", done=0)
     seed, camera_is_known = state.job.seed, state.job.camera_params is not None
-    models, matches = Path(state.job.folder, "models"), database
-    mapping, hold_focal, held = strategy.mapping or MappingOptions(), False, set[int]()
+    matches, mapping, hold_focal, held = database, strategy.mapping or MappingOptions(), False, set[int]()
     if state.thinned:
         matches = state.sibling("thinned")
         told = thin_matches(database, matches, camera_is_known=camera_is_known)
@@ -108,20 +108,19 @@ def run_mapping(strategy: Strategy, database: Path, state: JobState) -> Mapped |
     options = incremental_options(seed, mapping, camera_is_known, state.thinned, hold_focal, held)
     trusted = consecutive_pairs(state) if strategy.matches == "consecutive" else set[tuple[int, int]]()
     if strategy.mapping is None:
-        found = map_globally(matches, state.images, models, seed, camera_is_known)
-        shutil.rmtree(models)
+        found = _map_globally(matches, camera_is_known, state)
     else:
         found = _map_incrementally(matches, options, state)
         if found and (hold_focal or held):
             release_focal_lengths(found[0])
         if found and trusted:
             found = _most_steps(found, matches, mapping, hold_focal, state, trusted)
-    failure = _global_failure(global_run, state) if global_run else None
+    failure = _not_compared(global_run, state) if global_run else None
     mapped = None
     if found:
         if trusted:
             copy_consistent_matches(found[0], state.database, database, trusted)
-        other = load_native(global_run.folder) if global_run and not failure else None
+        other = global_mapping.found_models(global_run)[0] if global_run and not failure else None
         checked = _checked(found[0], other, MappingInput(database, matches, options, trusted), state)
         if other is None:
             compared = {"failed": failure} if global_run else None
@@ -256,14 +255,29 @@ def _start_global_mapping(
     return global_mapping.start(matches, thinned, state.images, folder, state.job.seed, cameras_are_known)
 
 
-def _global_failure(started: "global_mapping.Started", state: JobState) -> str | None:
-    """Why there is no model of global mapping to compare with, which is said; None if there is one. It may not take the
-    time in which the model that there is has to be adjusted."""
-    for_adjustment = FINAL_ADJUSTMENT_FACTOR * (time.monotonic() - started.began)
-    seconds = min(global_mapping.patience(started), state.left_at_most() - for_adjustment)
-    if failure := global_mapping.failure(started, seconds):
+def _not_compared(started: "global_mapping.Started", state: JobState) -> str | None:
+    """Why there is no model of global mapping to compare with, which is said; None if there is one."""
+    if failure := _global_failure(started, time.monotonic() - started.began, state):
         state.send(note=Note("sfm.not-compared", f"global mapping gave no model to compare with: {failure}"))
     return failure
+
+
+def _map_globally(matches: Path, camera_is_known: bool, state: JobState) -> list[Any]:
+    """All sub-models of global mapping, best first; none, which is said, where it does not end in time."""
+    folder, seed = state.log.folder / "global", state.job.seed
+    started = global_mapping.start(matches, None, state.images, folder, seed, camera_is_known)
+    if failure := _global_failure(started, mapping_seconds(state.log.outcomes), state):
+        state.send(note=Note("sfm.no-global-model", f"global mapping gave no model: {failure}"))
+        return []
+    return global_mapping.found_models(started)
+
+
+def _global_failure(started: "global_mapping.Started", mapped_for: float, state: JobState) -> str | None:
+    """Why there is no model of global mapping, None if there is one, where incremental mapping took so many seconds. It
+    may not take the time in which the best model has to be adjusted."""
+    for_adjustment = FINAL_ADJUSTMENT_FACTOR * mapped_for
+    seconds = min(global_mapping.patience(started, mapped_for), state.left_at_most() - for_adjustment)
+    return global_mapping.failure(started, seconds)
 
 
 def _checked(model: Any, other: Any, given: MappingInput, state: JobState) -> CheckedModel:

@@ -21,7 +21,7 @@ from stages.sfm.colmap.database.matching import (
     matched_pairs,
     verified_matches,
 )
-from stages.sfm.job import JobState
+from stages.sfm.job import Job, JobState
 from stages.sfm.pairs.match_graph import (
     MAX_GROWTH_ROUNDS,
     MIN_INLIERS,
@@ -53,7 +53,7 @@ def match_photos(strategy: Strategy, missing: list[int], state: JobState) -> tup
         best = state.usable()
         return state.latest(), best.match_graph if best else None
     if strategy.matches == "strict":
-        _extract(database, ExtractionOptions(job.max_image_size, job.max_features), state)
+        _extract(database, _extraction(job), state)
         graph = _match_all(database, exact, state)
     elif strategy.matches in ("missing", "relaxed"):
         database = state.sibling(strategy.matches)
@@ -71,12 +71,25 @@ def match_photos(strategy: Strategy, missing: list[int], state: JobState) -> tup
         copy_as_fisheye(latest, database, job.seed)
     else:
         database = state.sibling("more-features")
-        twice = ExtractionOptions(
-            2 * job.max_image_size, 2 * job.max_features, doubled_up_to=job.max_image_size, even_contrast=True
-        )
-        _extract(database, twice, state)
+        _extract(database, _extraction_of_more(job), state)
         graph = _match_all(database, False, state)  # exactly would take minutes, and find two in a hundred more
     return database, graph
+
+
+def _extraction(job: Job) -> ExtractionOptions:
+    return ExtractionOptions(job.max_image_size, job.max_features)
+
+
+def _extraction_of_more(job: Job) -> ExtractionOptions:
+    size = job.max_image_size
+    return ExtractionOptions(2 * size, 2 * job.max_features, doubled_up_to=size, even_contrast=True)
+
+
+def enlargement(state: JobState) -> float:
+    """The pixels that more features are extracted from, over those of the first strategy: not four times as many where
+    photos are small and were doubled before, or where their own size is less."""
+    once, more = _extraction(state.job), _extraction_of_more(state.job)
+    return sum(map(more.pixels, state.photos)) / sum(map(once.pixels, state.photos))
 
 
 def relaxed_partners(strategy: Strategy, neighbours: int, matched: int, missing: int) -> int:

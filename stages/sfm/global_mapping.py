@@ -1,8 +1,8 @@
-"""Global mapping (GLOMAP, Pan et al. 2024) of the same matches, to compare with, in a process of its own.
+"""Global mapping (GLOMAP, Pan et al. 2024) of the same matches, in a process of its own: it has no limit itself.
 
-It estimates all poses together, incremental mapping one after the other, so they go wrong in different ways. It works
-on fewer tracks, on a core that incremental mapping leaves free. ``python -P -m stages.sfm.global_mapping`` reads a job
-from stdin as one line of JSON, and writes the best model into its folder.
+It estimates all poses together, incremental mapping one after the other, so they go wrong in different ways. To compare
+with, it works on fewer tracks, on a core that incremental mapping leaves free. ``python -P -m
+stages.sfm.global_mapping`` reads a job from stdin as one line of JSON, and writes its models into its folder.
 """
 
 import json
@@ -12,40 +12,41 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from stages.io.amounts import rough_duration
-from stages.io.files import make_durable
 from stages.sfm.colmap.database.thinning import thin_matches
 from stages.sfm.colmap.mappers import map_globally
-from stages.sfm.colmap.models import write_native
+from stages.sfm.colmap.models import load_native, write_native
 from stages.sfm.job import end_with_parent
 from stages.sfm.worker_process import environment
 
 TRACKS_PER_PHOTO = 200  # of the best: enough for poses that are compared, not kept
-# It works on fewer tracks than incremental mapping, on a core of its own, and has no limit itself: where it takes so
-# many times as long, it will not end either.
+# Where it takes so many times as long as incremental mapping, it will not end either.
 MAX_TIMES, MIN_SECONDS = 4.0, 60.0
 MIN_PHOTOS = 10  # of fewer there is no telling which of two models is right
 COMMAND = ["-P", "-m", "stages.sfm.global_mapping"]
 
 
 class Started(NamedTuple):
-    """Global mapping that is running; its model comes into ``folder``."""
+    """Global mapping that is running; its models come into ``folder``."""
 
     process: "subprocess.Popen[bytes]"
     folder: Path
     began: float  # time.monotonic()
 
 
-def start(database: Path, thinned: Path, images: Path, folder: Path, seed: int, camera_is_known: bool) -> Started:
-    """Begin with the best matches of ``database``, copied to ``thinned``; the caller waits with :func:`failure`.
+def start(
+    database: Path, thinned: Path | None, images: Path, folder: Path, seed: int, camera_is_known: bool
+) -> Started:
+    """Begin with the matches of ``database``, or the best of them, copied to ``thinned``; the caller waits with
+    :func:`failure`.
 
     It ends with this process.
     """
     shutil.rmtree(folder, ignore_errors=True)
     paths = {"database": database, "thinned": thinned, "images": images, "folder": folder}
-    job = {name: str(path) for name, path in paths.items()} | {"seed": seed}
+    job = {name: path and str(path) for name, path in paths.items()} | {"seed": seed}
     process = subprocess.Popen([sys.executable, *COMMAND], stdin=subprocess.PIPE, stdout=2, env=environment())
     assert process.stdin
     process.stdin.write(json.dumps(job | {"camera_is_known": camera_is_known}).encode() + b"\n")
@@ -66,28 +67,29 @@ def failure(started: Started, seconds: float) -> str | None:
     return f"it ended with code {code}" if code else "it found no model"
 
 
-def patience(started: Started) -> float:
-    """For how many seconds to wait for it, once incremental mapping is done, which began at the same time."""
-    taken = time.monotonic() - started.began
-    return max(MIN_SECONDS, MAX_TIMES * taken) - taken
+def found_models(started: Started) -> list[Any]:
+    """All sub-models, best first, where there is no :func:`failure`."""
+    return [load_native(folder) for folder in sorted(started.folder.iterdir(), key=lambda one: int(one.name))]
+
+
+def patience(started: Started, mapping_seconds: float) -> float:
+    """For how many seconds to wait for it, where incremental mapping took so many."""
+    return max(MIN_SECONDS, MAX_TIMES * mapping_seconds) - (time.monotonic() - started.began)
 
 
 def main() -> None:
     """Read the job from stdin, do it."""
     job = json.loads(sys.stdin.buffer.readline())
     threading.Thread(target=end_with_parent, daemon=True).start()
-    folder = Path(job["folder"])
+    folder, database, known = Path(job["folder"]), Path(job["database"]), job["camera_is_known"]
+    if job["thinned"]:
+        thin_matches(database, thinned := Path(job["thinned"]), TRACKS_PER_PHOTO, camera_is_known=known)
+        database = thinned
     scratch = folder.with_name(f"{folder.name}.scratch")
-    thinned = Path(job["thinned"])
-    known = job["camera_is_known"]
-    thin_matches(Path(job["database"]), thinned, TRACKS_PER_PHOTO, camera_is_known=known)
-    models = map_globally(thinned, Path(job["images"]), scratch, job["seed"], known)
+    models = map_globally(database, Path(job["images"]), scratch, job["seed"], known)
     shutil.rmtree(scratch, ignore_errors=True)
-    if models:
-        unfinished = folder.with_name(f"{folder.name}.unfinished")
-        write_native(unfinished, models[0])
-        make_durable(unfinished)
-        unfinished.rename(folder)
+    for number, model in enumerate(models):
+        write_native(folder / str(number), model)
 
 
 if __name__ == "__main__":

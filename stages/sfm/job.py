@@ -1,8 +1,12 @@
-"""The job of the worker process and its state: what the parent asks for, what the strategies share, the time spent."""
+"""The job of the worker process and its state: what the parent asks for, what the strategies share, the time spent; how
+a worker ends with its parent, and the next one waits for that."""
 
+import ctypes
 import json
 import math
 import os
+import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -11,6 +15,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock
 
 from stages.io.files import write_durably
 from stages.io.photos import Photo
@@ -24,6 +30,7 @@ from stages.sfm.registration import MIN_MODEL_POINTS, MIN_REGISTERED
 from stages.sfm.retry_strategies import MAX_SECONDS_LIMIT, STRATEGIES, TIME_GIVEN, Outcome, StrategyLog, read_kept
 
 PHASE_SECONDS = "phase_seconds.json"
+PR_SET_PDEATHSIG = 1  # of prctl(2)
 SAVE_INTERVAL_SECONDS = 5.0  # whatever ends the process takes no more than these with it
 
 Send = Callable[..., None]
@@ -187,8 +194,17 @@ class PhaseTimer:
             self.phases[self._phase] = self.phases.get(self._phase, 0.0) + passed
 
 
+def worker_lock(folder: Path) -> FileLock:
+    """Held by a worker process as long as it works in this folder. It may outlive its parent for a while, and two at
+    work would write the same files."""
+    return FileLock(folder / "worker.lock")
+
+
 def end_with_parent() -> None:
-    """End this process when stdin does: the parent is gone."""
+    """End this process when stdin does: the parent is gone. Native code that holds the interpreter, as bundle
+    adjustment does for seconds or minutes, delays that; Linux does not wait for it."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     while os.read(0, 1):
         pass
     os._exit(1)

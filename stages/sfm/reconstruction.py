@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from filelock import Timeout
 
 from nerf.geometry.georeference import georeference
 from stages.contract import Note, Progress, StageError, listed
@@ -21,6 +22,7 @@ from stages.sfm.colmap.known_cameras import known_cameras
 from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.conventions import PoseConvention
 from stages.sfm.imported.import_poses import import_poses
+from stages.sfm.job import worker_lock
 from stages.sfm.pairs.pair_selection import capture_priors
 from stages.sfm.pairs.quality_level import GivenOptions, check_matcher, chosen
 from stages.sfm.registration import (
@@ -72,6 +74,7 @@ def find_cameras(config: "Config", ingest: Path, folder: Path, progress: Progres
     Raises StageError where no usable model comes out.
     """
     photos, matched = _photos(ingest)
+    _wait_for_worker(folder, progress)
     if config.cameras is not None:
         convention = PoseConvention(config.pose_direction, config.camera_axes)
         limits = config.adjust_poses, config.max_seconds
@@ -127,7 +130,6 @@ def _reconstruct(
         test_files=None,
         **{name: found[name] for name in FACTS},
     )
-    _remove_intermediate(folder)
     complete = all(image["registered"] for image in images)
     return registration, "" if complete else _skipped_for_time(found["skipped_for_time"])
 
@@ -193,6 +195,17 @@ def _check_camera(config: "Config", photos: Sequence[Photo], progress: Progress)
 # --- what an interrupted run left
 
 
+def _wait_for_worker(folder: Path, progress: Progress) -> None:
+    """Wait for the worker process of a run that was killed, which may not have ended yet."""
+    lock = worker_lock(folder)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        progress.update("waiting for the worker process of a killed run to end")
+        lock.acquire()
+    lock.release()
+
+
 def _database(folder: Path, names: Sequence[str], progress: Progress) -> Path:
     """The database of features and matches: an interrupted run's if it can be trusted, else none yet.
 
@@ -224,7 +237,8 @@ def _are_sound(strategies: Path) -> bool:
 
 
 def _remove_intermediate(folder: Path) -> None:
-    """Remove what only an interrupted run needs: the log first, for without the rest it would mislead."""
+    """Remove what an interrupted run left: the log first, for without the rest it would mislead. Of a finished run that
+    is the runner's to do, once its manifest is written: until then a kill would lose all of it."""
     (folder / "strategies" / LOG).unlink(missing_ok=True)
     shutil.rmtree(folder / "strategies", ignore_errors=True)
     for database in folder.glob("matches-*"):

@@ -22,6 +22,8 @@ MIN_LONG_FOCAL = 1.0
 # (docs/experiments/camera_models.md).
 FINAL_ADJUSTMENT_FACTOR = 2.0
 RELAXED_COST = 2.0  # of matching a pair by the relaxed ratio: its mismatches take longer to verify
+# Of extraction from as many pixels, of exact matching of as many features (docs/experiments/few_features.md).
+EVEN_CONTRAST_COST, INDEXED_COST = 1.25, 0.2
 ADDING = 0.4  # of the time of mapping, that a few images take to be registered in its model
 MAX_SECONDS_LIMIT, TIME_GIVEN = "--sfm.max-seconds", "the time it is given (--budget or --sfm.seconds)"
 LOG, ABANDONED = "outcomes.json", "abandoned.json"
@@ -200,28 +202,36 @@ def read_kept(path: Path) -> Any:
     return json.loads(path.read_bytes()) if path.exists() else []
 
 
-def expected_seconds(strategy: Strategy, outcomes: Sequence[Outcome], rematched: float) -> float:
-    """How long a strategy will take, by what those before it took. ``rematched``: the pairs that it matches by a
-    relaxed ratio test, over those that were matched first.
+def expected_seconds(strategy: Strategy, outcomes: Sequence[Outcome], rematched: float, enlarged: float) -> float:
+    """How long a strategy will take, by what those before it took. ``rematched``: the pairs that it matches again, over
+    those that were matched first (a pair that was matched exactly and is no more counts INDEXED_COST); ``enlarged``:
+    the pixels that it extracts features from, over the first's.
 
-    Mapping takes as long as it did at most; it is over sooner where nothing more is found. New features are extracted
-    from four times the pixels and are twice as many, which is four times the matching and twice the mapping.
+    Mapping takes as long as it did at most; it is over sooner where nothing more is found. More pixels yield more
+    features, at most twice as many, which is four times the matching and twice the mapping.
     """
-    first = outcomes[0].seconds
-    mapping = max(one.seconds["mapping"] for one in outcomes)
+    first, mapping = outcomes[0].seconds, mapping_seconds(outcomes)
+    if strategy.matches == "more features":
+        more = min(2.0, max(1.0, enlarged))
+        extraction = EVEN_CONTRAST_COST * enlarged * first["features"]
+        return extraction + more**2 * rematched * first["matching"] + more * mapping
     relaxed = RELAXED_COST * rematched * first["matching"]
     if strategy.matches == "missing":
         return relaxed + ADDING * mapping
-    if strategy.matches == "more features":
-        return 4 * (first["features"] + first["matching"]) + 2 * mapping
     again = {"same": 0.0, "consecutive": 0.0, "fisheye": first["matching"], "relaxed": relaxed}
     return again[strategy.matches] + mapping
+
+
+def mapping_seconds(outcomes: Sequence[Outcome]) -> float:
+    """How long incremental mapping took at most."""
+    incremental = {strategy.name for strategy in STRATEGIES if strategy.mapping}
+    return max(one.seconds["mapping"] for one in outcomes if one.name in incremental)
 
 
 def exceeds_time(expected: float, outcomes: Sequence[Outcome], left: float) -> bool:
     """Whether a strategy would not leave the time for the final bundle adjustment of its model, or of the best so
     far."""
-    return expected + FINAL_ADJUSTMENT_FACTOR * max(one.seconds["mapping"] for one in outcomes) > left
+    return expected + FINAL_ADJUSTMENT_FACTOR * mapping_seconds(outcomes) > left
 
 
 class Situation(NamedTuple):

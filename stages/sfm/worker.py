@@ -25,9 +25,10 @@ from stages.sfm.colmap.model_comparison import find_conflict
 from stages.sfm.colmap.models import load_native, turned_upright, write_native
 from stages.sfm.colmap.repair import deregister
 from stages.sfm.colmap.unregistered_images import links, supports
-from stages.sfm.extraction_and_matching import capture_sequence, match_photos, relaxed_pairs
-from stages.sfm.job import Job, JobState, Send, end_with_parent
+from stages.sfm.extraction_and_matching import capture_sequence, enlargement, match_photos, relaxed_pairs
+from stages.sfm.job import Job, JobState, Send, end_with_parent, worker_lock
 from stages.sfm.retry_strategies import (
+    INDEXED_COST,
     MIN_LONG_FOCAL,
     STRATEGIES,
     TIME_GIVEN,
@@ -54,7 +55,7 @@ def main() -> None:
         channel.write(json.dumps(message) + "\n")
 
     try:
-        with cluster.joined(job.cluster):
+        with worker_lock(Path(job.folder)), cluster.joined(job.cluster):
             send(result=reconstruct(job, send))
     except StageError as error:
         send(error=[error.code, error.what, error.why, error.hint])
@@ -150,7 +151,8 @@ def _try_strategies(state: JobState) -> None:
             why = f"{len(missing)} of {len(state.photos)} photos {are} unregistered"
             if _is_misfit(state):
                 why = "the cameras do not fit the verified matches"
-            duration = f" (about {rough_duration(takes)})" if takes >= MIN_SECONDS_SAID else ""
+            more = " more" if state.job.seconds is None else ""  # than was expected of the run; else they are given
+            duration = f" (about {rough_duration(takes)}{more})" if takes >= MIN_SECONDS_SAID else ""
             state.send(note=Note("sfm.strategy", f"{why}: {strategy.description}{duration}"))
             _try(strategy, missing, state)
     for why, descriptions in unsaid.items():
@@ -205,11 +207,14 @@ def _why_infeasible(strategy: Strategy, expected: float, state: JobState) -> Ski
 
 def _expected(strategy: Strategy, missing: list[int], state: JobState) -> float:
     """How many seconds the strategy will take."""
-    rematched = 0.0
+    rematched, enlarged = 0.0, 1.0
     if strategy.matches in ("missing", "relaxed"):
         matched = len(matched_pairs(state.database))
         rematched = relaxed_pairs(strategy, len(missing), matched, state) / max(1, matched)
-    return expected_seconds(strategy, state.log.outcomes, rematched)
+    elif strategy.matches == "more features":
+        rematched = INDEXED_COST if state.job.matcher == "exhaustive" else 1.0
+        enlarged = enlargement(state)
+    return expected_seconds(strategy, state.log.outcomes, rematched, enlarged)
 
 
 def _try(strategy: Strategy, missing: list[int], state: JobState) -> None:

@@ -1,6 +1,7 @@
 """SIGKILL during every stage, then the same command again: the result equals that of a run nobody disturbed."""
 
 import json
+import os
 import random
 import shutil
 import signal
@@ -13,10 +14,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipeline.engine.manifests import Manifest
 from pipeline.engine.stage_list import usual
+from pipeline.engine.workspace import Workspace
+from stages.sfm import worker_process
 from stages.sfm.worker_process import FIRST_STRATEGY, PHASES, REFINING
 from tests.drills.campaigns import RETRY, SFM_INSTANTS, Chain, reached
-from tests.drills.drill import Program, copy_workspace, results
+from tests.drills.drill import Prepare, Program, copy_workspace, results
 from tests.synthetic_photos import SyntheticPhotos
 
 FEATURES_FOUND = FIRST_STRATEGY * sum(PHASES["features"])  # how far stage sfm is once every photo's features are kept
@@ -93,22 +97,45 @@ def photos_and_a_stranger(synthetic_photos: SyntheticPhotos, tmp_path: Path) -> 
     return folder
 
 
+ADJUSTING = (
+    "import time, stages.sfm.worker as worker\n"
+    "worker.final_bundle_adjustment = lambda *_: time.sleep(600)\n"
+    "worker.main()"
+)
+
+
+def adjust_for_minutes() -> None:
+    """In the program: no machine is done with the final bundle adjustment before the kill."""
+    worker_process.COMMAND = ["-c", ADJUSTING]
+
+
+def die_before_the_manifest() -> None:
+    """In the program: it is killed with all results of a stage written, and no manifest."""
+
+    def die(self: Workspace, partial: Path, folder: Path, manifest: Manifest) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    Workspace.finish = die
+
+
 def test_killed_while_photos_are_matched(photos_and_a_stranger: Path, tmp_path: Path):
-    def sfm(name: str) -> Program:
+    def sfm(name: str, prepare: Prepare = None) -> Program:
         words = ["run", str(photos_and_a_stranger), "-o", str(tmp_path / name), "--json", "--until", "sfm"]
-        return Program([*words, "--sfm.max-features", "800"], tmp_path / "says")
+        return Program([*words, "--sfm.max-features", "800"], tmp_path / "says", prepare)
 
     assert reached(RETRY.name, sfm("undisturbed.nerf").finish().events())
     delays = random.Random(3)
     for instant in SFM_INSTANTS:
-        program = sfm("killed.nerf")
+        program = sfm("killed.nerf", adjust_for_minutes)
         assert program.wait_until(partial(reached, instant)), f"no kill at: {instant}"
-        last = instant == "final bundle adjustment"  # which a fast machine may be done with before it is killed
         program.process.join(delays.uniform(0.0, 0.1))
         program.strike(signal.SIGKILL)
-        assert program.wait() == -signal.SIGKILL or last
-    events = sfm("killed.nerf").finish().events()
-    done = {event["done"] for event in events if event["event"] == "progress" and event["stage"] == "sfm"}
-    assert done <= {None, FEATURES_FOUND, REFINING}, "only the final bundle adjustment was left to do"
-    assert not reached("matching", events) and not reached(RETRY.name, events)
+        assert program.wait() == -signal.SIGKILL
+    for prepare, ending in ((die_before_the_manifest, -signal.SIGKILL), (None, 0)):
+        program = sfm("killed.nerf", prepare)
+        assert program.wait() == ending
+        events = program.events()
+        done = {event["done"] for event in events if event["event"] == "progress" and event["stage"] == "sfm"}
+        assert done <= {None, FEATURES_FOUND, REFINING}, "only the final bundle adjustment was left to do"
+        assert not reached("matching", events) and not reached(RETRY.name, events)
     assert results(tmp_path / "killed.nerf") == results(tmp_path / "undisturbed.nerf")

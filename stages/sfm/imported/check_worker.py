@@ -33,7 +33,7 @@ from stages.sfm.colmap.model_check import ModelCheck, camera_poses, check_model,
 from stages.sfm.colmap.models import load_native
 from stages.sfm.imported.conventions import MIN_PAIRS, best_fit, fit_of_some
 from stages.sfm.imported.focal_lengths import fitting_focal_factor
-from stages.sfm.job import end_with_parent
+from stages.sfm.job import end_with_parent, worker_lock
 from stages.sfm.pairs.match_graph import MIN_INLIERS, natural_order, pairs_apart
 from stages.sfm.pairs.pair_selection import Pairs, closeness, nearest, union
 from stages.sfm.registration import count_done
@@ -121,8 +121,9 @@ def main() -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
     channel = os.dup(1)
     os.dup2(2, 1)  # nothing else may print there
-    for answer in check(**job):
-        os.write(channel, json.dumps(answer).encode() + b"\n")
+    with worker_lock(Path(job["folder"])):
+        for answer in check(**job):
+            os.write(channel, json.dumps(answer).encode() + b"\n")
 
 
 def check(

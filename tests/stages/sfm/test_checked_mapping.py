@@ -13,7 +13,14 @@ import pytest
 
 from stages.io.photos import Photo
 from stages.sfm import checked_mapping, global_mapping
-from stages.sfm.checked_mapping import Runs, _global_failure, _most_steps, _with_pieces_joined, calibrate_by_few
+from stages.sfm.checked_mapping import (
+    Runs,
+    _map_globally,
+    _most_steps,
+    _not_compared,
+    _with_pieces_joined,
+    calibrate_by_few,
+)
 from stages.sfm.colmap.database.calibration import Told, set_focal_length
 from stages.sfm.colmap.database.copies import copy_without_pairs
 from stages.sfm.colmap.database.images import fill_database
@@ -25,7 +32,7 @@ from stages.sfm.colmap.model_comparison import compare_models
 from stages.sfm.colmap.repair import (
     restricted,
 )
-from stages.sfm.retry_strategies import STRATEGIES, MappingOptions
+from stages.sfm.retry_strategies import STRATEGIES, MappingOptions, Outcome
 from tests.stages.sfm.colmap.made_models import (
     FOCAL_PX,
     PHOTOS,
@@ -179,7 +186,8 @@ def test_global_mapping_runs_beside_and_agrees(made: Made, tmp_path: Path) -> No
         made.database, tmp_path / "thinned.db", tmp_path, tmp_path / "global", 0, camera_is_known=False
     )
     assert global_mapping.failure(started, 600.0) is None
-    compared = compare_models(made.model, pycolmap.Reconstruction(tmp_path / "global"))
+    (model,) = global_mapping.found_models(started)
+    compared = compare_models(made.model, model)
     assert compared["agree"] == PHOTOS and compared["centre"] < 0.02 and compared["different"] == []
 
 
@@ -204,11 +212,36 @@ def test_global_mapping_that_does_not_end_is_given_up(
     process: Any = SimpleNamespace(wait=lambda timeout=None: waited.append(timeout), kill=lambda: waited.append("kill"))
     started = global_mapping.Started(process, Path("absent"), time.monotonic() - mapped_for)
     state: Any = SimpleNamespace(left_at_most=lambda: left, send=lambda note: notes.append(note))
-    _global_failure(started, state)
+    _not_compared(started, state)
     assert waited == [pytest.approx(seconds, abs=1.0)]
     monkeypatch.setattr(process, "wait", lambda timeout=None: waited.append(timeout) if timeout is None else late())
-    assert "given up" in (_global_failure(started, state) or "")
+    assert "given up" in (_not_compared(started, state) or "")
     assert waited[1:] == ["kill", None] and [note.code for note in notes] == ["sfm.not-compared"] * 2
+
+
+def retry(folder: Path, mapped_for: float, notes: list[str]) -> Any:
+    """What the retry by global mapping needs of the worker, where incremental mapping took so many seconds."""
+    log = SimpleNamespace(folder=folder, outcomes=[Outcome("default", "x.db", seconds={"mapping": mapped_for})])
+    return SimpleNamespace(
+        log=log,
+        images=folder,
+        job=SimpleNamespace(seed=0),
+        left_at_most=lambda: 1000.0,
+        send=lambda note: notes.append(note.code),
+    )
+
+
+def test_a_retry_by_global_mapping_finds_the_model(made: Made, tmp_path: Path) -> None:
+    (model,) = _map_globally(made.database, False, retry(tmp_path, 5.0, []))
+    assert compare_models(made.model, model)["agree"] == PHOTOS
+
+
+def test_a_retry_by_global_mapping_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    notes, began = list[str](), time.monotonic()
+    monkeypatch.setattr(global_mapping, "COMMAND", ["-c", "import time; time.sleep(600)"])
+    monkeypatch.setattr(global_mapping, "MIN_SECONDS", 1.0)
+    assert _map_globally(tmp_path / "x.db", False, retry(tmp_path, 0.5, notes)) == []
+    assert 2.0 <= time.monotonic() - began < 20.0 and notes == ["sfm.no-global-model"]
 
 
 def late() -> None:

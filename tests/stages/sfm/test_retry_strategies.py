@@ -16,6 +16,7 @@ from stages.sfm.retry_strategies import (
     abandon,
     exceeds_time,
     expected_seconds,
+    mapping_seconds,
     reason_against,
 )
 
@@ -85,16 +86,35 @@ TIMED = [
         ("missing photos", 2 * 0.75 * 40 + 0.4 * 30),
         ("weaker initial pair", 30),
         ("global mapping", 30),
-        ("more features", 4 * (10 + 40) + 2 * 30),
+        ("more features", 1.25 * 4 * 10 + 4 * 0.75 * 40 + 2 * 30),
     ],
 )
 def test_earlier_strategies_predict_the_seconds_of_the_next(name: str, seconds: float) -> None:
-    assert expected_seconds(BY_NAME[name], TIMED, 0.75) == pytest.approx(seconds)
+    assert expected_seconds(BY_NAME[name], TIMED, 0.75, 4.0) == pytest.approx(seconds)
 
 
 def test_a_strategy_must_leave_time_for_the_final_bundle_adjustment() -> None:
     assert exceeds_time(50.0, TIMED, 50.0 + 2 * 30 - 1)
     assert not exceeds_time(50.0, TIMED, 50.0 + 2 * 30 + 1)
+
+
+@pytest.mark.parametrize(
+    ("size", "longer", "enlarged"),
+    [(1600, 1536, 4), (1600, 1000, 1), (1600, 3000, (3000 / 1600) ** 2), (800, 1000, (1000 / 1600) ** 2)],
+    ids=["of usual size", "doubled before", "larger", "doubled no more"],
+)
+def test_more_features_take_time_by_their_pixels(size: int, longer: int, enlarged: float) -> None:
+    photo = SimpleNamespace(width=longer, height=longer // 2)
+    job = SimpleNamespace(matcher="exhaustive", max_image_size=size, max_features=500)
+    state: Any = SimpleNamespace(log=SimpleNamespace(outcomes=TIMED), photos=[photo], job=job)
+    more = min(2, max(1, enlarged))
+    seconds = 1.25 * enlarged * 10 + 0.2 * more**2 * 40 + more * 30
+    assert worker._expected(BY_NAME["more features"], [0], state) == pytest.approx(seconds)
+
+
+def test_global_mapping_does_not_predict_incremental_mapping() -> None:
+    hung = Outcome("global mapping", "x.db", seconds={"mapping": 500.0})
+    assert mapping_seconds([*TIMED, hung]) == 30
 
 
 def test_strategies_that_ended_the_worker_are_remembered(tmp_path: Path) -> None:

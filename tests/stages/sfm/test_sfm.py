@@ -142,7 +142,6 @@ def test_the_account_says_what_became_of_each_photo(reconstructed: Path) -> None
     assert account["reprojection_px"] == pytest.approx(model.error_px.mean())
     assert [image["observations"] for image in account["images"]] == np.bincount(model.view).tolist()
     assert all(image["keypoints"] > image["observations"] > 20 for image in account["images"])
-    assert sorted(path.name for path in reconstructed.iterdir()) == ["registration.json", "sfm.log", "sparse"]
 
 
 PROGRAM = """
@@ -290,7 +289,7 @@ def test_near_duplicates_are_unmatched_and_masks_exclude_features(
     others = model.xy[model.view == place[photos[4].image_name]]
     assert len(seen_at) > 20 and seen_at[:, 0].min() > 79
     assert (others[:, 0] < 79).sum() > 5
-    assert sorted(path.name for path in (tmp_path / "sfm").iterdir()) == ["registration.json", "sfm.log", "sparse"]
+    assert not (tmp_path / "sfm/masks").exists()
 
 
 def test_a_known_camera_is_kept(
@@ -395,7 +394,6 @@ def test_a_strategy_that_ended_the_worker_is_skipped(
     assert progress.names("sfm.strategy-failed-before", became, "registering them in the model")
     tried = {row["strategy"]: row["skipped"] for row in read_json(tmp_path / "sfm/registration.json")["strategies"]}
     assert became in tried["missing photos"]
-    assert not (tmp_path / "sfm/strategies").exists()
 
 
 def test_a_strategy_for_which_no_time_is_left_is_skipped(

@@ -49,6 +49,11 @@ class ExtractionOptions(NamedTuple):
         """Whether a photo is doubled before its features are extracted."""
         return max(photo.width, photo.height) <= self.doubled_up_to
 
+    def pixels(self, photo: Photo) -> float:
+        """From how many pixels features are extracted of a photo."""
+        reduced = min(1.0, self.max_image_size / max(photo.width, photo.height))
+        return photo.width * photo.height * (reduced * (2 if self.doubles(photo) else 1)) ** 2
+
     def larger(self) -> "ExtractionOptions":
         """Twice as many from about four times the pixels: of large photos their own, of others doubled ones."""
         twice = {"max_image_size": 2 * self.max_image_size, "max_features": 2 * self.max_features}
@@ -65,10 +70,8 @@ def feature_bytes(photos: Sequence[Photo], extraction: ExtractionOptions) -> flo
     """Memory that feature extraction takes for the largest of the photos, by its pixels as they are used."""
 
     def taken(photo: Photo) -> float:
-        longer = max(photo.width, photo.height)
-        scale = min(1.0, extraction.max_image_size / longer) * (2 if extraction.doubles(photo) else 1)
-        before = EVEN_BYTES_PER_PIXEL if extraction.even_contrast else 0
-        return photo.width * photo.height * max(BYTES_PER_PIXEL * scale**2, before)
+        before = EVEN_BYTES_PER_PIXEL * photo.width * photo.height if extraction.even_contrast else 0
+        return max(BYTES_PER_PIXEL * extraction.pixels(photo), before)
 
     return max(map(taken, photos))
 
