@@ -52,8 +52,9 @@ MAX_STEPS = 576  # bounded scenes: steps along the diagonal of the box, or as ma
 # finest cells along an axis: photos that stand next to each other see a thing move by some pixel from one to the next
 # (docs/experiments/forward_facing.md).
 NDC_STEPS_PER_CELL = 1 / 4
-# Contracted space: steps in one of the finest cells, and at most across all of it (docs/experiments/ray_samples.md).
-STEPS_PER_CELL, MAX_STEPS_ACROSS = 3, 3072
+# Contracted space: steps in one of the finest cells, by how many of these along an axis it counts for at most. Finer
+# cells gain more by more rays than by closer samples (docs/experiments/cell_sizes.md).
+STEPS_PER_CELL = {512: 3, 2048: 1.5}
 # Progress up to which steps along rays are long, on a CPU (docs/experiments/ray_samples.md). A GPU has one CUDA graph
 # for all of its steps; a finished training that goes on has thin surfaces already.
 LONG_STEPS_UNTIL = {"bounded": 0.0, "contracted": 1 / 3, "ndc": 1 / 3}
@@ -65,7 +66,7 @@ SAMPLES_PER_RAY = {"bounded": 3, "contracted": 10, "ndc": 6}
 """Colours computed for a ray, over a run: measured on lego_400 and five photo sets."""
 SIZES = {
     "bounded": ((200e6, 8, 19, 1024), (50e6, 5, 18, 512), (0, 4, 17, 256)),
-    "contracted": ((130e6, 8, 19, 2048), (30e6, 6, 18, 1024), (0, 5, 17, 512)),
+    "contracted": ((75e6, 8, 19, 2048), (30e6, 6, 18, 1024), (0, 5, 17, 512)),
     "ndc": ((130e6, 8, 19, 2048), (30e6, 6, 18, 1024), (0, 5, 17, 512)),
 }
 """(computed colours from which on it pays, num_levels, log2_hashmap_size, most max_res), the largest first
@@ -244,7 +245,7 @@ def field_settings(config: Config, background_model: bool, space: SpaceMap | Non
     across = math.sqrt(3) * grid.max_res
     in_box = min(across, max(MAX_STEPS, grid.max_res))
     steps = NDC_STEPS_PER_CELL * grid.max_res if config.space == "ndc" else in_box
-    shortest = 2 * Contraction.half / (min(STEPS_PER_CELL * grid.max_res, MAX_STEPS_ACROSS) * grid.ray_samples)
+    shortest = 2 * Contraction.half / (_steps_across(grid.max_res) * grid.ray_samples)
     return HashGridSettings(
         num_levels=grid.num_levels,
         log2_hashmap_size=grid.log2_hashmap_size,
@@ -258,6 +259,11 @@ def field_settings(config: Config, background_model: bool, space: SpaceMap | Non
         view_dependence=config.view_dependence,
         background_model=background_model,
     )
+
+
+def _steps_across(max_res: int) -> float:
+    """The shortest steps that fit along an axis of contracted space whose finest cells are so many."""
+    return max(per_cell * min(max_res, most) for most, per_cell in STEPS_PER_CELL.items())
 
 
 def _trainer_settings(config: Config, scene: "Scene", seed: int) -> HashGridTrainerSettings:

@@ -198,7 +198,7 @@ def test_samples_follow_occupied_cells() -> None:
     sizes = (with_grid(contracted, max_res=max_res) for max_res in (256, 512, 700, 1024, 2048, 4096))
     fields = [field_settings(config, background_model=False) for config in sizes]
     steps = [field.min_step_size for field in fields]
-    assert steps == [4 / 768, 4 / 1536, 4 / 2100, 4 / 3072, 4 / 3072, 4 / 3072]
+    assert steps == [4 / 768, 4 / 1536, 4 / 1536, 4 / 1536, 4 / 3072, 4 / 3072]
     assert all(field.cone_angle == field.min_step_size / 0.25 for field in fields)
 
 
