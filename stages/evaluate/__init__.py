@@ -77,7 +77,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 STAGE = Stage(
     name="evaluate",
     inputs=("ingest", "normalise", "train"),
-    version=18,
+    version=19,
     exit_code=15,
     published=("metrics.json", "renders", "errors"),
     config=Config,

@@ -111,7 +111,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 STAGE = Stage(
     name="render",
     inputs=("normalise", "train"),
-    version=15,
+    version=16,
     exit_code=16,
     published=("video.mp4", "depth.mp4", "path.json"),
     config=Config,

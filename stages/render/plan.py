@@ -22,8 +22,8 @@ def choose_frames_and_width(
     must be even.
 
     With more rays the video grows in this order: 6 frames up to a long side of 200 pixels, then up to 24 frames, then
-    up to 480 pixels, then up to 120 frames, then up to ``longest``. It never has less than 6 frames of 32 pixels, 16
-    wide.
+    both together up to 120 frames of 480 pixels, then up to ``longest``. It never has less than 6 frames of 32 pixels,
+    16 wide.
     """
     long_side = max(camera.width, camera.height)
     squares = rays / (camera.width * camera.height / long_side**2)
@@ -35,9 +35,13 @@ def choose_frames_and_width(
         frames = frames or count(width * long_side / camera.width, MIN_STILLS, MAX_FRAMES)
         return frames, width
     if frames is None:
-        frames = count(min(DEFAULT_SIDE, longest), MIN_FRAMES, MAX_FRAMES)
-        if squares < frames * min(SMALL_SIDE, longest) ** 2:
-            frames = count(min(SMALL_SIDE, longest), MIN_STILLS, MIN_FRAMES)
+        small, usual = min(SMALL_SIDE, longest), min(DEFAULT_SIDE, longest)
+        moving, full = MIN_FRAMES * small**2, MAX_FRAMES * usual**2
+        if squares < moving:
+            frames = count(small, MIN_STILLS, MIN_FRAMES)
+        else:  # each grows by the same power of the rays
+            grown = math.log(squares / moving) / math.log(full / moving)
+            frames = min(MAX_FRAMES, int(MIN_FRAMES * (MAX_FRAMES / MIN_FRAMES) ** grown))
     side = min(max(math.sqrt(squares / frames), MIN_SIDE), longest)
     return frames, even_width(side * camera.width / long_side)
 

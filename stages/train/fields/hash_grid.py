@@ -57,7 +57,7 @@ NDC_STEPS_PER_CELL = 1 / 4
 STEPS_PER_CELL = {512: 3, 2048: 1.5}
 # Progress up to which steps along rays are long, on a CPU (docs/experiments/ray_samples.md). A GPU has one CUDA graph
 # for all of its steps; a finished training that goes on has thin surfaces already.
-LONG_STEPS_UNTIL = {"bounded": 0.0, "contracted": 0.0, "ndc": 1 / 3}
+LONG_STEPS_UNTIL = {"bounded": 0.0, "contracted": 1 / 3, "ndc": 1 / 3}
 EVEN_UNTIL = 0.25  # contracted space: scene units from the camera up to which steps are even; beyond, they grow
 # Contracted space: at the shortest steps so many samples reach to a distance of 23; --train.grid.ray-samples may ask
 # for more.
@@ -66,7 +66,7 @@ SAMPLES_PER_RAY = {"bounded": 3, "contracted": 10, "ndc": 6}
 """Colours computed for a ray, over a run: measured on lego_400 and five photo sets."""
 SIZES = {
     "bounded": ((200e6, 8, 19, 1024), (50e6, 5, 18, 512), (0, 4, 17, 256)),
-    "contracted": ((130e6, 8, 19, 2048), (30e6, 6, 18, 1024), (0, 5, 17, 512)),
+    "contracted": ((75e6, 8, 19, 2048), (30e6, 6, 18, 1024), (0, 5, 17, 512)),
     "ndc": ((130e6, 8, 19, 2048), (30e6, 6, 18, 1024), (0, 5, 17, 512)),
 }
 """(computed colours from which on it pays, num_levels, log2_hashmap_size, most max_res), the largest first

@@ -60,13 +60,14 @@ def test_rays_are_not_left_over_before_the_video_is_full(rays, longest) -> None:
     [
         (6 * 100**2, 6, 100),  # too few for anything that moves
         (12 * 200**2, 12, 200),
-        (24 * 300**2, 24, 300),
-        (60 * 480**2, 60, 480),
+        (24 * 200**2, 24, 200),
+        (24 * 5**0.5 * 200 * 480, 53, 310),  # half-way between this and full length
+        (120 * 480**2, 120, 480),
         (120 * 600**2, 120, 600),
         (1e9, 120, 800),
     ],
 )
-def test_growing_rays_go_into_size_then_length_then_size(squares: float, frames: int, side: int) -> None:
+def test_growing_rays_go_into_size_then_length_then_both(squares: float, frames: int, side: int) -> None:
     assert choose_frames_and_width(1.0001 * squares * 1000 / 1600, LANDSCAPE, 800.0, None, None) == (frames, side)
 
 
