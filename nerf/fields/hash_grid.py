@@ -118,8 +118,8 @@ class HashGridSettings:
 
     @property
     def render_stepping(self) -> RayStepping:
-        """Of the samples of rays that are rendered without training: RENDER_SAMPLE_RATIO times as many if unbounded, but
-        in contracted space no more than RENDER_STEPS across it unless training has more.
+        """Of the samples of rays that are rendered without training: RENDER_SAMPLE_RATIO times as many if unbounded; in
+        contracted space no more than RENDER_STEPS across it, unless training has more.
 
         Training jitters its samples, so that over many steps it meets what lies between them; a rendering samples fixed
         places, once, and would show the gaps as shells. In a box samples are closer.
