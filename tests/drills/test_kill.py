@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.engine.manifests import Manifest
+from pipeline.engine.manifest_file import Manifest
 from pipeline.engine.stage_list import usual
 from pipeline.engine.workspace import Workspace
 from stages.sfm import worker_process
