@@ -10,6 +10,7 @@ MIN_POINTS_IN_VIEW = 10  # fewer say nothing about a photo's depth range; all ph
 QUANTILES = (0.002, 0.5, 0.999)  # near, median and far distance of what a photo sees
 NEAR_MARGIN = 0.7  # bare surfaces carry no points: the nearest thing may be nearer than the nearest point
 SURE_VIEWS = 3  # photos that see a point which is no false match
+MAX_POINTS = 100_000  # looked for in every photo, or the time grows with the square of the photos
 MIN_NEAR = 0.05 * REGION_HALF_SIZE  # for cameras in the region whose depths nobody knows
 BEYOND = 2.0  # a camera far from the region sees at least as far behind it as it is in front of it
 MAX_FAR, MIN_FAR = 1000.0, 20.0  # contraction maps these to 0.001 and 0.05 from the end of the world
@@ -51,6 +52,7 @@ def _points_range(scene: Reconstruction) -> tuple[Float[np.ndarray, "n"], Float[
         return np.full(count, np.nan), np.zeros(count)
     distances = scene.distances()
     sure = scene.points[np.bincount(scene.point, minlength=len(scene.points)) >= SURE_VIEWS]
+    sure = sure[:: -(-len(sure) // MAX_POINTS) or 1]
     of_all = np.quantile(distances, QUANTILES)
     near, far = np.empty(count), np.empty(count)
     for view, own in enumerate(observations_by_view(scene.view, count)):

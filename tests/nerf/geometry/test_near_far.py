@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nerf.geometry import near_far
 from nerf.geometry.near_far import MIN_NEAR, near_and_far, near_and_far_between_views
 from tests.camera_layouts import ball, ring, seen_by
 
@@ -58,3 +59,13 @@ def test_the_order_of_observations_changes_nothing() -> None:
     near, far = near_and_far(scene, bounded=False)
     np.testing.assert_array_equal(near_and_far(other, bounded=False), (near, far))
     assert near[3] == near_and_far(replace(scene, view=np.where(scene.view == 3, 4, scene.view)), bounded=False)[0][3]
+
+
+def test_of_many_points_some_tell(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = seen_by(ring(), ball())
+    near, far = near_and_far(scene, bounded=False)
+    monkeypatch.setattr(near_far, "MAX_POINTS", len(scene.points) // 3)
+    of_some = near_and_far(scene, bounded=False)
+    np.testing.assert_allclose(of_some, (near, far), rtol=0.1)
+    monkeypatch.setattr(near_far, "MAX_POINTS", 1)
+    assert (near_and_far(scene, bounded=False)[0] >= near).all()
