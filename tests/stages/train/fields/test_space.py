@@ -134,11 +134,11 @@ def grey_dataset(scene: Scene) -> RayDataset:
         ("ndc", "cpu", None, 1 / 3),
         ("ndc", "cuda", None, 0.0),
         ("ndc", "cpu", "finished", 0.0),
-        ("contracted", "cpu", None, 0.0),
+        ("contracted", "cpu", None, 1 / 3),
         ("bounded", "cpu", None, 0.0),
     ],
 )
-def test_steps_are_long_at_first_in_ndc_on_a_cpu(
+def test_steps_are_long_at_first_without_bounds_on_a_cpu(
     space: Space, device: str, after: str | None, long_until: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = with_defaults(
