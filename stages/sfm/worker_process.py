@@ -65,7 +65,8 @@ def run_worker(
     if "result" not in latest:
         limit = config.max_seconds if late else None
         last = latest.get("fault") or _last_line(log)
-        raise _worker_failed(status, limit, latest["phase"], last, _without(latest["strategy"], status, late, log), log)
+        strategy = STRATEGIES[0].name if latest["phase"] == "refining" else latest["strategy"]  # none is at work then
+        raise _worker_failed(status, limit, latest["phase"], last, _without(strategy, status, late, log), log)
     return latest["result"]
 
 

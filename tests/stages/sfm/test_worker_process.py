@@ -2,18 +2,22 @@
 
 import json
 import select
+import signal
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from stages.sfm import worker_process
+from stages.contract import StageError
+from stages.sfm import Config, worker_process
 from stages.sfm.job import worker_lock
 from stages.sfm.pairs import quality_level
 from stages.sfm.reconstruction import _wait_for_worker
+from stages.sfm.worker_process import Ending
 
 
 @pytest.mark.parametrize("command_line", [worker_process.COMMAND, quality_level.COMMAND])
@@ -85,3 +89,20 @@ def test_the_program_waits_for_an_orphaned_worker(tmp_path: Path, progress) -> N
     assert time.monotonic() - began > 0.5 and len(progress.updates) == 1
     _wait_for_worker(tmp_path, progress)
     assert len(progress.updates) == 1, "there is none any more"
+
+
+@pytest.mark.parametrize(("phase", "abandoned"), [("mapping", True), ("refining", False)])
+def test_the_strategy_at_work_alone_is_abandoned(
+    phase: str, abandoned: bool, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(command: object, log: Path, job: object, seconds: float, hear: Callable[..., None]) -> Ending:
+        log.touch()
+        hear({"strategy": "fisheye"})
+        hear({"phase": phase, "done": 0})
+        return Ending(-signal.SIGKILL, False)
+
+    monkeypatch.setattr(worker_process, "run_child", killed)
+    with pytest.raises(StageError) as caught:
+        worker_process.run_worker(Config(), [], tmp_path, tmp_path, tmp_path / "database.db", progress)
+    assert caught.value.code == "sfm.worker-killed"
+    assert (tmp_path / "strategies" / "abandoned.json").exists() == abandoned
