@@ -43,9 +43,7 @@ MAX_SIZES = {
     "diagonal_steps": 10**6,
     "max_samples_per_ray": 10**6,
 }
-# Samples of a rendered ray for one in training, and the finest steps across contracted space that gain anything
-# (docs/experiments/ray_samples.md).
-RENDER_SAMPLE_RATIO, RENDER_STEPS = 1.5, 2304
+RENDER_SAMPLE_RATIO = 1.5  # samples of a rendered ray for one in training (docs/experiments/ray_samples.md)
 # Optical thickness below which training keeps a sample with a probability only (docs/experiments/ray_samples.md).
 THINNING_THRESHOLD = 1e-2
 # Opacity that takes the colour of a neighbouring sample when an image is rendered (docs/experiments/colour_samples.md)
@@ -118,15 +116,12 @@ class HashGridSettings:
 
     @property
     def render_stepping(self) -> RayStepping:
-        """Of the samples of rays that are rendered without training: RENDER_SAMPLE_RATIO times as many if unbounded; in
-        contracted space no more than RENDER_STEPS across it, unless training has more.
+        """Of the samples of rays that are rendered without training: RENDER_SAMPLE_RATIO times as many if unbounded.
 
-        Training jitters its samples, so that over many steps it meets what lies between them; a rendering samples fixed
-        places, once, and would show the gaps as shells. In a box samples are closer.
+        Training jitters samples that stand a few finest cells apart, so that over many steps it meets what lies between
+        them; a rendering samples fixed places, once, and would show the gaps as shells. In a box samples are closer.
         """
-        stepping, closer = self.stepping, RENDER_SAMPLE_RATIO if self.space.unbounded else 1.0
-        if self.space.bends_rays:
-            closer = max(1.0, min(closer, RENDER_STEPS * stepping.step_size / (2 * self.space.half)))
+        stepping, closer = self.stepping, RENDER_SAMPLE_RATIO if self.space.unbounded else 1
         return stepping._replace(
             step_size=stepping.step_size / closer,
             cone_angle=stepping.cone_angle / closer,

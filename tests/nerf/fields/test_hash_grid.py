@@ -147,13 +147,6 @@ def test_contracted_space_is_rendered_with_closer_samples_than_trained() -> None
     assert field().render_stepping == field().stepping
 
 
-def test_fine_steps_of_training_are_not_rendered_finer() -> None:
-    fine = replace(CONTRACTED, min_step_size=4 / 3072, cone_angle=4 / 3072)
-    assert fine.render_stepping == fine.stepping
-    between = replace(CONTRACTED, min_step_size=4 / 1920, cone_angle=4 / 1920)
-    assert between.render_stepping.step_size == pytest.approx(4 / 2304)
-
-
 def test_closed_cells_are_not_seen() -> None:
     model, given = field(), rays()
     model.set_occupancy(torch.zeros_like(model.occupancy_bits))
