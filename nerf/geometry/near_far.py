@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf import REGION_HALF_SIZE
-from nerf.geometry.reconstruction import Reconstruction, observations_by_view
+from nerf.geometry.reconstruction import Reconstruction, observations_by_view, thinned
 
 MIN_POINTS_IN_VIEW = 10  # fewer say nothing about a photo's depth range; all photos together then do
 QUANTILES = (0.002, 0.5, 0.999)  # near, median and far distance of what a photo sees
@@ -51,8 +51,7 @@ def _points_range(scene: Reconstruction) -> tuple[Float[np.ndarray, "n"], Float[
     if not len(scene.point):
         return np.full(count, np.nan), np.zeros(count)
     distances = scene.distances()
-    sure = scene.points[np.bincount(scene.point, minlength=len(scene.points)) >= SURE_VIEWS]
-    sure = sure[:: -(-len(sure) // MAX_POINTS) or 1]
+    sure = thinned(scene.points[np.bincount(scene.point, minlength=len(scene.points)) >= SURE_VIEWS], MAX_POINTS)
     of_all = np.quantile(distances, QUANTILES)
     near, far = np.empty(count), np.empty(count)
     for view, own in enumerate(observations_by_view(scene.view, count)):

@@ -104,6 +104,11 @@ def within(values: Float[np.ndarray, "m d"], box: Float[np.ndarray, "2 d"]) -> B
     return ((values >= box[0]) & (values <= box[1])).all(axis=1)
 
 
+def thinned(points: Float[np.ndarray, "n d"], most: int) -> Float[np.ndarray, "m d"]:
+    """Every k-th of the points, with the least k that leaves ``most`` of them or fewer."""
+    return points[:: -(-len(points) // most) or 1]
+
+
 def spatial_median(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "d"]:
     """The point of least summed distance to ``points``, of which a third may be far outliers.
 

@@ -17,6 +17,7 @@ from typing import Literal, NamedTuple, TypeVar
 import numpy as np
 
 from nerf.geometry.normalisation import Normalisation
+from nerf.geometry.reconstruction import thinned
 from nerf.geometry.region_of_interest import CaptureType
 from nerf.geometry.scene import Split
 from stages.contract import Progress, listed
@@ -135,8 +136,7 @@ class _Masks:
         self.image = {photo.name: model.images[i] for photo, i in zip(photos, order, strict=True)}
         self.train = _of_training(photos, split)
         seen = np.bincount(model.point[np.isin(model.view, _of_training(order, split))], minlength=len(model.xyz))
-        firm = model.xyz[seen >= MIN_PHOTOS]
-        self.points = firm[:: -(-len(firm) // MAX_POINTS) or 1]
+        self.points = thinned(model.xyz[seen >= MIN_PHOTOS], MAX_POINTS)
         self.outlines = dict[str, Outline]()  # by the names of their photos
         masked = [photo for photo in self.train if photo.mask]
         self.few = [masked[i] for i in spread(len(masked), min(len(masked), FEW))]

@@ -65,8 +65,9 @@ def run_worker(
     if "result" not in latest:
         limit = config.max_seconds if late else None
         last = latest.get("fault") or _last_line(log)
-        strategy = STRATEGIES[0].name if latest["phase"] == "refining" else latest["strategy"]  # none is at work then
-        raise _worker_failed(status, limit, latest["phase"], last, _without(strategy, status, late, log), log)
+        refining = latest["phase"] == "refining"  # when no strategy is at work
+        without = None if refining else _without(latest["strategy"], status, late, log)
+        raise _worker_failed(status, limit, latest["phase"], last, without, log)
     return latest["result"]
 
 
