@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -46,9 +47,29 @@ def run_worker(
         "cluster": cluster.address(),
         **config.model_dump(exclude=NOT_PASSED),
     }
+    began, log = time.monotonic(), folder / "sfm.log"
+    while True:
+        left = config.max_seconds - (time.monotonic() - began)
+        status, late, latest = _run_once(job | {"max_seconds": left}, log, len(photos), progress)
+        if error := latest.get("error"):
+            raise StageError(*error)
+        if "result" in latest:
+            return latest["result"]
+        ended = _abandon_retry(latest, status, late, log)
+        if ended and not late:
+            text = f"going on without the retry strategy {latest['strategy']!r}, because {ended.why}. Log: {log}"
+            progress.note("sfm.strategy-crashed", text)
+            continue
+        limit = config.max_seconds if late else None
+        raise _worker_failed(status, limit, latest["phase"], latest.get("fault") or _last_line(log), log)
+
+
+def _run_once(
+    job: dict[str, Any], log: Path, photos: int, progress: Progress
+) -> tuple[int, bool, dict[str, Any]]:
+    """Run the worker to its end: its exit status, whether it was late, and the latest of everything it said."""
     latest: dict[str, Any] = {"phase": "features", "database": job["database"], "done": 0, "pairs": 0}
     latest["strategy"] = STRATEGIES[0].name
-    log = folder / "sfm.log"
 
     def hear(message: dict[str, Any]) -> None:
         if note := message.pop("note", None):
@@ -56,19 +77,10 @@ def run_worker(
         begins = message.get("phase", latest["phase"]) != latest["phase"]
         latest.update(message)
         if begins:  # a phase may take less than the live line waits
-            progress.update(*_describe(latest, len(photos)))
+            progress.update(*_describe(latest, photos))
 
-    with live_line(progress, lambda: _describe(latest, len(photos))):
-        status, late = run_child(COMMAND, log, job, config.max_seconds, hear)
-    if error := latest.get("error"):
-        raise StageError(*error)
-    if "result" not in latest:
-        limit = config.max_seconds if late else None
-        last = latest.get("fault") or _last_line(log)
-        refining = latest["phase"] == "refining"  # when no strategy is at work
-        without = None if refining else _without(latest["strategy"], status, late, log)
-        raise _worker_failed(status, limit, latest["phase"], last, without, log)
-    return latest["result"]
+    with live_line(progress, lambda: _describe(latest, photos)):
+        return *run_child(COMMAND, log, job, job["max_seconds"], hear), latest
 
 
 class Ending(NamedTuple):
@@ -103,16 +115,17 @@ def run_child(
     return Ending(status, late)
 
 
-def _without(strategy: str, status: int, late: bool, log: Path) -> str | None:
-    """The hint to run again without the strategy that failed, which is noted; None for the first: it is always
-    tried."""
-    if strategy == STRATEGIES[0].name or not (late or status):
+def _abandon_retry(latest: Mapping[str, Any], status: int, late: bool, log: Path) -> Skip | None:
+    """Note that the retry strategy in which the worker failed is not to be tried again, and why; None where none is at
+    work: the first strategy is always tried, and the final adjustment belongs to all."""
+    first = latest["strategy"] == STRATEGIES[0].name
+    if first or latest["phase"] == "refining" or not (late or status) or _disk_is_full(log):
         return None
     # Also where it was killed: most often for want of memory, and then it would be every time.
     became = "was killed, most likely because memory ran out" if status == -signal.SIGKILL else "ended the program"
     ended = Skip("it ran out of time", for_time=True) if late else Skip(f"it {became}")
-    abandon(log.parent / "strategies", strategy, ended)
-    return f"Run again: the strategy {strategy!r} is then skipped. Log: {log}"
+    abandon(log.parent / "strategies", latest["strategy"], ended)
+    return ended
 
 
 def _start(command: Sequence[str], stderr: IO[bytes]) -> subprocess.Popen[bytes]:
@@ -167,21 +180,23 @@ def _last_line(log: Path) -> str:
     return lines[-1].strip() if lines else "it printed no message"
 
 
-def _worker_failed(
-    status: int, limit: float | None, phase: str, last: str, without: str | None, log: Path
-) -> StageError:
-    """``last``: the last message of the worker; ``without``: the hint where running again skips the strategy that
-    failed."""
-    free = shutil.disk_usage(log.parent).free
-    if free < MIN_FREE_BYTES:  # COLMAP and its database report it in other words, or do not notice
-        last += f"; the disk is full, with {free / 2**20:.1f} MB free"
+def _disk_is_full(log: Path) -> bool:
+    """COLMAP and its database report it in other words, or do not notice."""
+    return shutil.disk_usage(log.parent).free < MIN_FREE_BYTES
+
+
+def _worker_failed(status: int, limit: float | None, phase: str, last: str, log: Path) -> StageError:
+    """``last``: the last message of the worker."""
+    if _disk_is_full(log):
+        last += f"; the disk is full, with {shutil.disk_usage(log.parent).free / 2**20:.1f} MB free"
     where = f"while {phase}" if phase != "features" else "while extracting features"
     if limit is not None:
         return StageError(
             "sfm.timeout",
             f"structure from motion was stopped {where}",
             f"it took longer than {limit:g} s",
-            without or "Raise --sfm.max-seconds, or give fewer photos; the matches found so far are kept.",
+            "Raise --sfm.max-seconds, or give fewer photos; the matches found so far are kept. A retry strategy that "
+            "ran out of time is skipped the next time.",
         )
     if status < 0:
         name = signal.Signals(-status).name
@@ -190,8 +205,8 @@ def _worker_failed(
             "sfm.worker-killed",
             f"structure from motion was killed by {name} {where}",
             "the machine most likely ran out of memory" if memory else f"COLMAP crashed ({last})",
-            without or f"Run again: the matches are kept. To use less memory: --sfm.max-features 2048. Log: {log}",
+            f"Run again: the matches are kept. To use less memory: --sfm.max-features 2048. Log: {log}",
         )
     return StageError(
-        "sfm.worker-failed", f"structure from motion failed {where}", last, without or f"The whole log is in {log}"
+        "sfm.worker-failed", f"structure from motion failed {where}", last, f"The whole log is in {log}"
     )

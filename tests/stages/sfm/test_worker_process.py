@@ -17,6 +17,7 @@ from stages.sfm import Config, worker_process
 from stages.sfm.job import worker_lock
 from stages.sfm.pairs import quality_level
 from stages.sfm.reconstruction import _wait_for_worker
+from stages.sfm.retry_strategies import read_kept
 from stages.sfm.worker_process import Ending
 
 
@@ -91,18 +92,26 @@ def test_the_program_waits_for_an_orphaned_worker(tmp_path: Path, progress) -> N
     assert len(progress.updates) == 1, "there is none any more"
 
 
-@pytest.mark.parametrize(("phase", "abandoned"), [("mapping", True), ("refining", False)])
-def test_the_strategy_at_work_alone_is_abandoned(
-    phase: str, abandoned: bool, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("late", [False, True])
+def test_only_the_strategy_at_work_is_abandoned(
+    late: bool, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    endings = [("fisheye", "mapping", late), ("missing photos", "matching", False), ("other seed", "refining", False)]
+    limits: list[float] = []
+
     def killed(command: object, log: Path, job: object, seconds: float, hear: Callable[..., None]) -> Ending:
         log.touch()
-        hear({"strategy": "fisheye"})
+        limits.append(seconds)
+        strategy, phase, late = endings.pop(0)
+        hear({"strategy": strategy})
         hear({"phase": phase, "done": 0})
-        return Ending(-signal.SIGKILL, False)
+        return Ending(-signal.SIGKILL, late)
 
     monkeypatch.setattr(worker_process, "run_child", killed)
     with pytest.raises(StageError) as caught:
         worker_process.run_worker(Config(), [], tmp_path, tmp_path, tmp_path / "database.db", progress)
-    assert caught.value.code == "sfm.worker-killed"
-    assert (tmp_path / "strategies" / "abandoned.json").exists() == abandoned
+    assert caught.value.code == ("sfm.timeout" if late else "sfm.worker-killed")
+    abandoned = dict(read_kept(tmp_path / "strategies" / "abandoned.json"))
+    assert sorted(abandoned) == (["fisheye"] if late else ["fisheye", "missing photos"])
+    assert progress.codes == ([] if late else ["sfm.strategy-crashed"] * 2)
+    assert limits == sorted(limits, reverse=True) and limits[-1] < Config().max_seconds
