@@ -9,7 +9,7 @@ import numpy as np
 from nerf.effects.statistics.background import background_statistic, untracked_share
 from nerf.effects.statistics.exposure import ExposureFit, exposure_statistic, fit_exposure
 from nerf.effects.statistics.outlier_images import OutlierImages, outlier_images
-from nerf.effects.statistics.poses import common_residuals, pose_statistic
+from nerf.effects.statistics.pose_refinement import common_residuals, pose_statistic
 from nerf.effects.statistics.statistic import Statistic, unknown
 from nerf.effects.statistics.tracks import TrackColours
 from nerf.effects.statistics.vignetting import RadialSlope, radial_slope
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
-REFERENCE_PX = 1000  # the longer side, as nerf/effects/statistics/poses.py says in its unit
+REFERENCE_PX = 1000  # the longer side, as nerf/effects/statistics/pose_refinement.py says in its unit
 GAIN_DIGITS = 4  # of logarithms: a hundredth of what they are known to
 
 

@@ -33,8 +33,8 @@ from stages.mesh.grid_space import (
 )
 from stages.mesh.iso_level import DIVERGED_HINT, IsoLevel, check_range, choose_iso_level
 from stages.mesh.marching_cubes import extract_surface
+from stages.mesh.photos.best_photos import BestPhotos, find_best_photos
 from stages.mesh.photos.refinement import Refined, refine
-from stages.mesh.photos.sightings import Sightings, find_sightings
 from stages.mesh.preview import preview, small_copy
 from stages.mesh.resolution import CHUNK, grid_box, point_cost, slab_factor
 from stages.mesh.surface import Surface, components, face_areas, is_watertight, keep_faces, vertex_normals
@@ -129,12 +129,12 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     cropped = _cropped(config, cleaned.surface, source, progress)
     surface = _decimated(config, cropped, source.space)
     ends = boundary(surface, extent, voxel_size, cropped=len(cropped.faces) < len(cleaned.surface.faces))
-    surface, refined, sightings = _refined(config, surface, source, voxel_size, progress)
+    surface, refined, best_photos = _refined(config, surface, source, voxel_size, progress)
     if config.close:
         surface, closed = close_holes(surface, config.close)
         ends = "watertight" if is_watertight(surface) else ends
         if config.texture_size > 0:  # of the new vertices, too
-            sightings = _sightings(surface, source, voxel_size, progress, 0.65)
+            best_photos = _best_photos(surface, source, voxel_size, progress, 0.65)
     else:
         closed = Closed(0, 0, 0.0)
     if config.max_faces is not None and len(surface.faces) > config.max_faces:
@@ -147,7 +147,7 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     nearest = KDTree(cleaned.surface.vertices).query(surface.vertices)[1]
     directions, of_raw = visibility.direction[cleaned.vertex[nearest]], cleaned.surface.vertices[nearest]
     colours = vertex_colours(source.model, of_raw, directions, voxel_size.at(of_raw).along, source.device)
-    textured = _textured(config, surface, colours, sightings, progress)
+    textured = _textured(config, surface, colours, best_photos, progress)
     mesh = ColouredMesh(*surface, vertex_normals(surface), colours, textured and textured.texture)
     voxel = float(np.median(voxel_size.at(surface.vertices).along))
     parts = int(components(surface).max()) + 1
@@ -188,50 +188,52 @@ def _cropped(config: "Config", surface: Surface, source: Source, progress: Progr
     return keep_faces(surface, inside)[0]
 
 
-def _sightings(surface: Surface, source: Source, voxel_size: VoxelSize, progress: Progress, begin: float) -> Sightings:
+def _best_photos(
+    surface: Surface, source: Source, voxel_size: VoxelSize, progress: Progress, begin: float
+) -> BestPhotos:
     """The photos that see the vertices; ``begin``: how far the stage is."""
 
     def report(done: float) -> None:
         progress.update("which photos see the surface", begin + 0.05 * done)
 
     voxels = voxel_size.at(surface.vertices)
-    return find_sightings(surface, source.scene, source.ingest, source.info, voxels, report)
+    return find_best_photos(surface, source.scene, source.ingest, source.info, voxels, report)
 
 
 def _refined(
     config: "Config", surface: Surface, source: Source, voxel_size: VoxelSize, progress: Progress
-) -> tuple[Surface, Refined | None, Sightings | None]:
+) -> tuple[Surface, Refined | None, BestPhotos | None]:
     """The surface moved to where the photos agree, if asked for, what that gained, and the photos that see it: None
     where neither this nor a texture needs them."""
     if not config.refine and config.texture_size == 0:
         return surface, None, None
-    sightings = _sightings(surface, source, voxel_size, progress, 0.55)
+    best_photos = _best_photos(surface, source, voxel_size, progress, 0.55)
     if not config.refine:
-        return surface, None, sightings
+        return surface, None, best_photos
 
     def report(done: float) -> None:
         progress.update("refining the surface", 0.6 + 0.05 * done)
 
-    refined = refine(surface, sightings, voxel_size.at(surface.vertices), report)
+    refined = refine(surface, best_photos, voxel_size.at(surface.vertices), report)
     if refined is None:
         progress.note("mesh.not-refined", "hardly any of the surface is visible in two photos: it is not refined")
-        return surface, None, sightings
+        return surface, None, best_photos
     if not refined.kept:
         progress.note("mesh.no-better-refined", "the photos agree no better on the refined surface: it stays as it was")
-    return refined.surface, refined, sightings
+    return refined.surface, refined, best_photos
 
 
 def _textured(
-    config: "Config", surface: Surface, colours: np.ndarray, sightings: Sightings | None, progress: Progress
+    config: "Config", surface: Surface, colours: np.ndarray, best_photos: BestPhotos | None, progress: Progress
 ) -> Textured | None:
     """The texture asked for; None for one colour per vertex."""
-    if config.texture_size == 0 or sightings is None:
+    if config.texture_size == 0 or best_photos is None:
         return None
 
     def report(what: str, done: float) -> None:
         progress.update(what, 0.7 + 0.25 * done)
 
-    textured = texture_of(surface, colours, sightings, config.texture_size, report)
+    textured = texture_of(surface, colours, best_photos, config.texture_size, report)
     if textured is None:
         progress.note("mesh.no-photo-sees-it", "no photo sees the surface: it has colours of the field and no texture")
     return textured

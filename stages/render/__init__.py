@@ -7,7 +7,7 @@ from pydantic import Field, field_validator
 
 from stages.contract import Auto, Flexible, Inputs, Progress, Stage, StageConfig, StageResult, Workload
 from stages.io.files import read_scene, write_json
-from stages.render.plan import MAX_GIVEN_FPS, MIN_WIDTH, PathKind, even_width
+from stages.render.planning import MAX_GIVEN_FPS, MIN_WIDTH, PathKind, even_width
 from stages.train import trained_seconds
 
 

@@ -18,7 +18,7 @@ from nerf.geometry.scene import Camera, Scene, Similarity
 from stages.contract import StageError, bounded
 from stages.io.transforms_export import OPENGL_FROM_OPENCV
 from stages.io.transforms_files import pose_matrix, read_transforms
-from stages.render.plan import MAX_GIVEN_FPS, PathKind
+from stages.render.planning import MAX_GIVEN_FPS, PathKind
 from stages.sfm.colmap.cameras import camera_rays, rescaled
 from stages.sfm.imported.transforms_intrinsics import intrinsics_of, read_intrinsics
 

@@ -22,7 +22,7 @@ from stages.io.photos import spread
 from stages.io.transforms_export import intrinsics, opengl_matrix
 from stages.io.video import video_writer
 from stages.render.path import CameraPath, default_path, make_path, path_from_file, path_rays
-from stages.render.plan import MIN_FRAMES, SMALL_SIDE, choose_frames_and_width, default_fps, max_useful_side
+from stages.render.planning import MIN_FRAMES, SMALL_SIDE, choose_frames_and_width, default_fps, max_useful_side
 from stages.render.renderer import Renderer, TimeBudget, measured_speed
 
 if TYPE_CHECKING:

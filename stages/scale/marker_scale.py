@@ -11,10 +11,10 @@ import numpy as np
 from nerf.geometry.scene import Scene, View
 from stages.contract import Note, Progress, listed
 from stages.io.pixels import load_pixels, loaders
-from stages.scale.detection import cells_of, find_markers, locate_corners, luminance, printed_markers
+from stages.scale.marker_detection import cells_of, find_markers, locate_corners, luminance, printed_markers
 from stages.scale.marker_names import Marker, parse_marker
 from stages.scale.references import MAX_STANDARD_ERRORS, Reference
-from stages.scale.square_fit import Sightings, Square, fit_square
+from stages.scale.square_fit import CornerObservations, Square, fit_square
 from stages.sfm.colmap.cameras import mean_focal_and_centre
 
 if TYPE_CHECKING:
@@ -36,17 +36,17 @@ def marker_references(config: "Config", scene: Scene, ingest: Path, progress: Pr
     markers = [parse_marker(marker) for marker in config.marker]
     if not markers:
         return
-    sightings = _search(markers, scene, ingest, progress)
-    missing = [marker for marker in markers if not sightings[marker]]
+    detections = _search(markers, scene, ingest, progress)
+    missing = [marker for marker in markers if not detections[marker]]
     why = _why_missing(missing, markers, scene, ingest, progress)
     for marker in markers:
         if marker in why:
             yield _unusable(marker, 0, why[marker], progress)
         else:
-            yield _measured(marker, sightings[marker], scene, progress)
+            yield _measured(marker, detections[marker], scene, progress)
 
 
-class _Sighting(NamedTuple):
+class _Detection(NamedTuple):
     """A marker in a view; ``times`` in this photo."""
 
     view: int
@@ -54,30 +54,32 @@ class _Sighting(NamedTuple):
     times: int
 
 
-def _search(markers: Sequence[Marker], scene: Scene, ingest: Path, progress: Progress) -> dict[Marker, list[_Sighting]]:
+def _search(
+    markers: Sequence[Marker], scene: Scene, ingest: Path, progress: Progress
+) -> dict[Marker, list[_Detection]]:
     """Where each marker is seen, by views."""
     wanted = {(marker.dictionary, marker.number): marker for marker in markers}
     cells = {marker.dictionary: cells_of(marker.dictionary) for marker in markers}
 
-    def search(index: int) -> list[tuple[Marker, _Sighting]]:
+    def search(index: int) -> list[tuple[Marker, _Detection]]:
         view = scene.views[index]
         photo, camera = _photo(view, scene, ingest), scene.cameras[view.camera]
         found = [(d, each) for d in cells for each in find_markers(photo, d) if (d, each.number) in wanted]
         if not found:
             return []
-        light, sightings = luminance(photo), []
+        light, detections = luminance(photo), []
         for dictionary, each in found:
             corners = locate_corners(light, each, cells[dictionary], camera)
             if corners is not None:
                 times = sum((d, other.number) == (dictionary, each.number) for d, other in found)
-                sightings.append((wanted[dictionary, each.number], _Sighting(index, corners, times)))
-        return sightings
+                detections.append((wanted[dictionary, each.number], _Detection(index, corners, times)))
+        return detections
 
-    seen: dict[Marker, list[_Sighting]] = {marker: [] for marker in markers}
+    seen: dict[Marker, list[_Detection]] = {marker: [] for marker in markers}
     with ThreadPoolExecutor(loaders(ingest / view.file for view in scene.views)) as pool:
-        for done, sightings in enumerate(pool.map(search, range(len(scene.views)))):
-            for marker, sighting in sightings:
-                seen[marker].append(sighting)
+        for done, detections in enumerate(pool.map(search, range(len(scene.views)))):
+            for marker, detection in detections:
+                seen[marker].append(detection)
             progress.update("markers in the photos", done / len(scene.views))
     return seen
 
@@ -116,15 +118,15 @@ def _why_missing(
     return {marker: MIRRORED if marker in mirrored else otherwise for marker in missing}
 
 
-def _measured(marker: Marker, seen: Sequence[_Sighting], scene: Scene, progress: Progress) -> Reference:
+def _measured(marker: Marker, seen: Sequence[_Detection], scene: Scene, progress: Progress) -> Reference:
     """What a marker says that is seen somewhere."""
-    photos = len({sighting.view for sighting in seen})
+    photos = len({detection.view for detection in seen})
     if photos < 2:
         return _unusable(marker, photos, ONE_PHOTO, progress)
-    once = [sighting for sighting in seen if sighting.times == 1]
+    once = [detection for detection in seen if detection.times == 1]
     if photos - len(once) > MAX_REPEATED * photos:
         return _unusable(marker, photos, REPEATED, progress)
-    square = fit_square(_sightings(once, scene))
+    square = fit_square(_corner_observations(once, scene))
     if square is None or square.agreeing.mean() < MIN_AGREEING:
         return _unusable(marker, photos, SEVERAL_PLACES, progress)
     error = square.standard_error / square.side
@@ -135,13 +137,15 @@ def _measured(marker: Marker, seen: Sequence[_Sighting], scene: Scene, progress:
     return _reference(marker, square, max(error, IRREGULARITY_ERROR * square.irregularity), scene)
 
 
-def _sightings(seen: Sequence[_Sighting], scene: Scene) -> Sightings:
-    views = [scene.views[sighting.view] for sighting in seen]
+def _corner_observations(seen: Sequence[_Detection], scene: Scene) -> CornerObservations:
+    views = [scene.views[detection.view] for detection in seen]
     rotations = np.stack([view.scene_from_camera[:, :3].T for view in views])
     centres = np.stack([view.scene_from_camera[:, 3] for view in views])
     translations = -(rotations @ centres[..., None])
     focal = np.array([mean_focal_and_centre(scene.cameras[view.camera])[0] for view in views])
-    return Sightings(np.concatenate([rotations, translations], axis=2), np.stack([s.corners for s in seen]), focal)
+    return CornerObservations(
+        np.concatenate([rotations, translations], axis=2), np.stack([s.corners for s in seen]), focal
+    )
 
 
 def _reference(marker: Marker, square: Square, error: float, scene: Scene) -> Reference:

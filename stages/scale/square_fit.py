@@ -22,7 +22,7 @@ HUBER_PX = 1.0
 GROUPS = 20  # of photos, each left out once
 
 
-class Sightings(NamedTuple):
+class CornerObservations(NamedTuple):
     """A square in n photos: ``camera_from_world`` [R | t], the corners as x/z, y/z of their ray directions, and what a
     unit of these is in pixels."""
 
@@ -30,9 +30,9 @@ class Sightings(NamedTuple):
     corners: Float[np.ndarray, "n 4 2"]
     focal_px: Float[np.ndarray, "n"]
 
-    def of(self, which: Bool[np.ndarray, "n"]) -> "Sightings":
+    def of(self, which: Bool[np.ndarray, "n"]) -> "CornerObservations":
         """Those of some photos."""
-        return Sightings(*(each[which] for each in self))
+        return CornerObservations(*(each[which] for each in self))
 
 
 class Square(NamedTuple):
@@ -46,7 +46,7 @@ class Square(NamedTuple):
     agreeing: Bool[np.ndarray, "n"]
 
 
-def fit_square(seen: Sightings) -> Square | None:
+def fit_square(seen: CornerObservations) -> Square | None:
     """The square that most photos agree on; None where no two do."""
     agreeing = _largest_agreement(seen)
     if agreeing.sum() < 2:
@@ -65,7 +65,7 @@ def fit_square(seen: Sightings) -> Square | None:
     return Square(side, side * relative, _corners(solved.x), float(max(sides) / min(sides)) - 1, agreeing)
 
 
-def triangulate(seen: Sightings) -> Float[np.ndarray, "4 3"]:
+def triangulate(seen: CornerObservations) -> Float[np.ndarray, "4 3"]:
     """Each corner by itself: the point with the least algebraic error (Hartley and Zisserman 2004, section 12.2)."""
     rows = seen.corners[..., None] * seen.camera_from_world[:, None, None, 2] - seen.camera_from_world[:, None, :2]
     equations = rows.transpose(1, 0, 2, 3).reshape(4, -1, 4)
@@ -75,7 +75,7 @@ def triangulate(seen: Sightings) -> Float[np.ndarray, "4 3"]:
     return np.array(solution)
 
 
-def _largest_agreement(seen: Sightings) -> Bool[np.ndarray, "n"]:
+def _largest_agreement(seen: CornerObservations) -> Bool[np.ndarray, "n"]:
     """The photos that agree with the place that two of them tell, for the two with which most agree."""
     count = len(seen.focal_px)
     best = np.zeros(count, bool)
@@ -90,7 +90,7 @@ def _largest_agreement(seen: Sightings) -> Bool[np.ndarray, "n"]:
     return best
 
 
-def _projected(points: Float[np.ndarray, "4 3"], seen: Sightings) -> Float[np.ndarray, "n 4 2"]:
+def _projected(points: Float[np.ndarray, "4 3"], seen: CornerObservations) -> Float[np.ndarray, "n 4 2"]:
     """x/z, y/z in each photo; NaN behind it."""
     rotation, translation = seen.camera_from_world[:, :, :3], seen.camera_from_world[:, :, 3]
     in_camera = points @ rotation.transpose(0, 2, 1) + translation[:, None]
@@ -104,7 +104,7 @@ def _corners(parameters: Float[np.ndarray, "7"]) -> Float[np.ndarray, "4 3"]:
     return np.exp(parameters[6]) * (turned + parameters[3:6])
 
 
-def _solve(seen: Sightings, start: Float[np.ndarray, "7"]):
+def _solve(seen: CornerObservations, start: Float[np.ndarray, "7"]):
     def residuals(parameters: Float[np.ndarray, "7"]) -> Float[np.ndarray, "m"]:
         off = (_projected(_corners(parameters), seen) - seen.corners) * seen.focal_px[:, None, None]
         return np.where(np.isfinite(off), off, 1e3).ravel()
@@ -122,7 +122,7 @@ def _error_by_residuals(solved) -> float:
         return float("inf")
 
 
-def _error_by_jackknife(seen: Sightings, start: Float[np.ndarray, "7"]) -> float:
+def _error_by_jackknife(seen: CornerObservations, start: Float[np.ndarray, "7"]) -> float:
     """The standard error of the logarithm of the side by leaving out one group of photos after the other; 0 for two
     photos, of which one alone tells no size."""
     count = len(seen.focal_px)

@@ -18,7 +18,7 @@ from stages.io.ascii_names import shell_quoted
 from stages.io.photos import Photo, read_photos
 from stages.sfm.colmap.cameras import is_valid
 from stages.sfm.colmap.database.extraction import ExtractionOptions, feature_bytes
-from stages.sfm.colmap.known_cameras import known_cameras
+from stages.sfm.colmap.given_intrinsics import given_intrinsics
 from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.conventions import PoseConvention
 from stages.sfm.imported.import_poses import import_poses
@@ -168,7 +168,7 @@ def _check_camera(config: "Config", photos: Sequence[Photo], progress: Progress)
     if config.camera_model is None:
         raise StageError("sfm.parameters-without-model", what, "--sfm.camera-model is missing", hint)
     try:
-        cameras = known_cameras(photos, config.camera_model, config.camera_params)
+        cameras = given_intrinsics(photos, config.camera_model, config.camera_params)
     except ValueError as error:
         raise StageError("sfm.parameter-count", what, str(error), hint) from error
     if not any(cameras):

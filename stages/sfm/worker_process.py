@@ -64,9 +64,7 @@ def run_worker(
         raise _worker_failed(status, limit, latest["phase"], latest.get("fault") or _last_line(log), log)
 
 
-def _run_once(
-    job: dict[str, Any], log: Path, photos: int, progress: Progress
-) -> tuple[int, bool, dict[str, Any]]:
+def _run_once(job: dict[str, Any], log: Path, photos: int, progress: Progress) -> tuple[int, bool, dict[str, Any]]:
     """Run the worker to its end: its exit status, whether it was late, and the latest of everything it said."""
     latest: dict[str, Any] = {"phase": "features", "database": job["database"], "done": 0, "pairs": 0}
     latest["strategy"] = STRATEGIES[0].name
@@ -207,6 +205,4 @@ def _worker_failed(status: int, limit: float | None, phase: str, last: str, log:
             "the machine most likely ran out of memory" if memory else f"COLMAP crashed ({last})",
             f"Run again: the matches are kept. To use less memory: --sfm.max-features 2048. Log: {log}",
         )
-    return StageError(
-        "sfm.worker-failed", f"structure from motion failed {where}", last, f"The whole log is in {log}"
-    )
+    return StageError("sfm.worker-failed", f"structure from motion failed {where}", last, f"The whole log is in {log}")

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from nerf.effects.statistics.additive_model import additive_model
 from nerf.effects.statistics.exposure import EV, THRESHOLD_EV, ExposureFit, or_all
 from nerf.effects.statistics.outlier_images import OutlierImages
-from nerf.effects.statistics.poses import PX, THRESHOLD_PX
+from nerf.effects.statistics.pose_refinement import PX, THRESHOLD_PX
 from nerf.effects.statistics.statistic import OF_GAUSSIAN, Statistic, classify, unknown
 from nerf.effects.statistics.tracks import MAX_IN_TRACK, TrackColours, within_groups
 from nerf.rendering.srgb_arrays import linear_light
@@ -149,7 +149,7 @@ def rolling_shutter_statistic(
 ) -> Statistic:
     """The error at the upper and lower edges of a frame of usual motion, PX: half the product of the motion and of the
     readout as a part of the time between frames. Called for where it harms as wrong poses do
-    (nerf/effects/statistics/poses.py).
+    (nerf/effects/statistics/pose_refinement.py).
 
     ``residual``: observed minus projected, PX; ``row``: across the sensor's rows, as a share of the photo
     (:func:`across_rows`); ``motion``: how far the picture moves from a frame to the next, PX, NaN where it is not known

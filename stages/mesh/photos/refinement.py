@@ -28,8 +28,8 @@ from scipy.sparse.linalg import cg
 
 from nerf.runtime.parallel import in_order
 from stages.mesh.grid_space import VoxelLengths
+from stages.mesh.photos.best_photos import BestPhotos, smooth_normals
 from stages.mesh.photos.photo import Photo, projected, read_picture
-from stages.mesh.photos.sightings import Sightings, smooth_normals
 from stages.mesh.surface import Surface, face_area_vectors
 
 USED_PHOTOS = 5  # per vertex: the best, and those that look from elsewhere
@@ -103,25 +103,25 @@ class Patches(NamedTuple):
 
 
 def refine(
-    surface: Surface, sightings: Sightings, voxels: VoxelLengths, report: Callable[[float], None]
+    surface: Surface, best_photos: BestPhotos, voxels: VoxelLengths, report: Callable[[float], None]
 ) -> Refined | None:
     """Move the vertices of a surface; faces stay. ``voxels``: how well each vertex is known. None where two photos show
     hardly anything of it. Raises StageError where a photo is gone."""
-    photos = _photos_apart(surface, sightings)
-    patches = _patches(surface, sightings, photos, voxels)
+    photos = _photos_apart(surface, best_photos)
+    patches = _patches(surface, best_photos, photos, voxels)
     seen = patches.shared()
     if seen.sum() < MIN_SEEN:
         return None
-    fine = _pictures(surface, sightings, photos, voxels, report)
+    fine = _pictures(surface, best_photos, photos, voxels, report)
     coarse = {number: _coarser(grey) for number, grey in fine.items()}
     before = _agreement(patches, fine, IN_PLACE)[seen]
     moved = surface
     for sweep, pictures, done in ((COARSE, coarse, 0.7), (FINE, fine, 0.95)):
-        offset, worth = _best_offsets(_agreement(patches, pictures, sweep), sweep, sightings.means)
-        step = _balanced(moved, patches, offset, worth, sightings.means).clip(-sweep.reach, sweep.reach)
+        offset, worth = _best_offsets(_agreement(patches, pictures, sweep), sweep, best_photos.means)
+        step = _balanced(moved, patches, offset, worth, best_photos.means).clip(-sweep.reach, sweep.reach)
         shifted = moved.vertices + patches.normals * (step * patches.normal)[:, None]
         moved = Surface(_unturned(moved, shifted), moved.faces)
-        patches = _patches(moved, sightings, photos, voxels)
+        patches = _patches(moved, best_photos, photos, voxels)
         report(done)
     after = _agreement(patches, fine, IN_PLACE)[seen]
     shift = (np.linalg.norm(moved.vertices - surface.vertices, axis=1) / voxels.across)[seen]
@@ -129,17 +129,17 @@ def refine(
     return refined if refined.kept else refined._replace(surface=surface, shift=0.0)
 
 
-def _photos_apart(surface: Surface, sightings: Sightings) -> np.ndarray:
+def _photos_apart(surface: Surface, best_photos: BestPhotos) -> np.ndarray:
     """For each vertex the best photo, then by turns the best of the others times how far apart it looks from."""
-    count, slots = sightings.number.shape
-    towards = sightings.centres()[sightings.number] - surface.vertices[:, None]
+    count, slots = best_photos.number.shape
+    towards = best_photos.centres()[best_photos.number] - surface.vertices[:, None]
     towards = (towards / np.linalg.norm(towards, axis=2, keepdims=True)).astype(np.float32)
     found, row = np.full((count, USED_PHOTOS), -1), np.arange(count)
-    gain = np.where(sightings.whole, sightings.quality, 0)
+    gain = np.where(best_photos.whole, best_photos.quality, 0)
     for turn in range(min(USED_PHOTOS, slots)):
         best = gain.argmax(axis=1)
         left = gain[row, best] > 0
-        found[left, turn] = sightings.number[row, best][left]
+        found[left, turn] = best_photos.number[row, best][left]
         cosine = np.einsum("nsc,nc->ns", towards, towards[row, best])
         gain *= np.minimum(np.arccos(cosine.clip(-1, 1)) / APART, 1)
         gain[row, best] = 0
@@ -147,12 +147,12 @@ def _photos_apart(surface: Surface, sightings: Sightings) -> np.ndarray:
 
 
 def _pictures(
-    surface: Surface, sightings: Sightings, photos: np.ndarray, voxels: VoxelLengths, report: Callable[[float], None]
+    surface: Surface, best_photos: BestPhotos, photos: np.ndarray, voxels: VoxelLengths, report: Callable[[float], None]
 ) -> dict[int, Grey]:
     """Each photo that shows a vertex, at a size at which samples of the fine patches are PIXELS_PER_SAMPLE apart."""
-    centres, downscale, pixels = sightings.centres(), dict[int, float](), 0.0
+    centres, downscale, pixels = best_photos.centres(), dict[int, float](), 0.0
     for number in np.unique(photos[photos >= 0]).tolist():
-        photo, vertex = sightings.photos[number], np.flatnonzero((photos == number).any(axis=1))
+        photo, vertex = best_photos.photos[number], np.flatnonzero((photos == number).any(axis=1))
         distance = np.linalg.norm(surface.vertices[vertex] - centres[number], axis=1)
         apart = 2 * FINE.half / (SIDE - 1) * float(np.median(voxels.across[vertex] / distance)) * photo.focal_px
         downscale[number] = max(1.0, apart / PIXELS_PER_SAMPLE)
@@ -160,7 +160,7 @@ def _pictures(
     smaller = max(1.0, (2 * pixels / MAX_PICTURE_BYTES) ** 0.5)
 
     def read(number: int) -> Grey:
-        photo = sightings.photos[number]
+        photo = best_photos.photos[number]
         picture = read_picture(photo, smaller * downscale[number])
         return Grey(photo, np.asarray(cv2.cvtColor(picture.pixels, cv2.COLOR_RGB2GRAY)), picture.used)
 
@@ -179,9 +179,9 @@ def _coarser(grey: Grey) -> Grey:
     return Grey(grey.photo, np.asarray(pixels), np.asarray(used))
 
 
-def _patches(surface: Surface, sightings: Sightings, photos: np.ndarray, voxels: VoxelLengths) -> Patches:
-    normals = smooth_normals(surface, sightings.means)
-    sight = surface.vertices - sightings.centres()[photos[:, 0].clip(0)]
+def _patches(surface: Surface, best_photos: BestPhotos, photos: np.ndarray, voxels: VoxelLengths) -> Patches:
+    normals = smooth_normals(surface, best_photos.means)
+    sight = surface.vertices - best_photos.centres()[photos[:, 0].clip(0)]
     cosine = (sight * normals).sum(axis=1) / np.maximum(np.linalg.norm(sight, axis=1), np.finfo(float).tiny)
     normal = np.sqrt((cosine * voxels.along) ** 2 + (1 - cosine**2).clip(0) * voxels.across**2)
     return Patches(surface.vertices, normals, photos, voxels.across, normal)

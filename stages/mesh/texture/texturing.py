@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stages.hardware.memory import check_memory
-from stages.mesh.photos.sightings import Sightings
+from stages.mesh.photos.best_photos import BestPhotos
 from stages.mesh.surface import Surface
 from stages.mesh.texture.atlas import Texture, make_atlas
 from stages.mesh.texture.baking import bake
@@ -29,15 +29,17 @@ class Textured(NamedTuple):
 def texture_of(
     surface: Surface,
     field_colours: np.ndarray,
-    sightings: Sightings,
+    best_photos: BestPhotos,
     max_size: int,
     report: Callable[[str, float], None],
 ) -> Textured | None:
     """The texture of a surface in the scene frame, at most ``max_size`` texels a side. ``field_colours`` (n, 3) sRGB
     uint8 of the vertices hold where no photo sees them. None where no photo sees any of the surface. Raises StageError
     where that is too small, too large for the memory, or a photo is gone."""
-    photos, means = sightings.photos, sightings.means
-    candidates = find_candidates(surface, sightings, lambda done: report("choosing photos for the texture", 0.3 * done))
+    photos, means = best_photos.photos, best_photos.means
+    candidates = find_candidates(
+        surface, best_photos, lambda done: report("choosing photos for the texture", 0.3 * done)
+    )
     own = field_colours.astype(np.float32) / 255
     choice = choose(candidates, own, surface.faces, means, len(photos))
     best = np.sqrt(choice.candidates.pixels_of_best())

@@ -14,8 +14,8 @@ import torch
 from scipy.sparse import csr_array
 
 from nerf.runtime.parallel import in_order
+from stages.mesh.photos.best_photos import BestPhotos
 from stages.mesh.photos.photo import Photo, Picture, colours_at, projected, read_picture, used_at
-from stages.mesh.photos.sightings import Sightings
 from stages.mesh.surface import Surface, face_area_vectors
 
 SATURATED, OF_SATURATED = 0.985, 0.05  # a photo's colour above which its light is not known, and what it counts then
@@ -28,7 +28,7 @@ OUTLIER_SPREADS, MIN_OUTLIER, OUTLIER_SHARE, OUTLIER_STEPS = 3.0, 0.10, 0.25, 3
 
 
 class Candidates(NamedTuple):
-    """The best photos of each vertex as in :class:`Sightings`, their ``quality`` less where they are saturated, and
+    """The best photos of each vertex as in :class:`BestPhotos`, their ``quality`` less where they are saturated, and
     their ``colour`` (n, KEPT_PHOTOS, 3) at the scale of the surface's edges."""
 
     photo: np.ndarray
@@ -61,15 +61,15 @@ class Choice(NamedTuple):
         return dense
 
 
-def find_candidates(surface: Surface, sightings: Sightings, on_photo: Callable[[float], None]) -> Candidates:
+def find_candidates(surface: Surface, best_photos: BestPhotos, on_photo: Callable[[float], None]) -> Candidates:
     """What the best photos show of every vertex."""
     edge = float(np.sqrt(np.median(np.linalg.norm(face_area_vectors(*surface), axis=1))))
-    quality = sightings.quality.copy()
+    quality = best_photos.quality.copy()
     colour = np.zeros((*quality.shape, 3), np.float32)
 
     def shown_by(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        photo = sightings.photos[number]
-        vertex, slot = np.nonzero((sightings.number == number) & (sightings.quality > 0))
+        photo = best_photos.photos[number]
+        vertex, slot = np.nonzero((best_photos.number == number) & (best_photos.quality > 0))
         if len(vertex) == 0:
             return vertex, slot, np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
         points = surface.vertices[vertex]
@@ -77,12 +77,12 @@ def find_candidates(surface: Surface, sightings: Sightings, on_photo: Callable[[
         edge_px = edge * photo.focal_px / float(np.median(place.depth))
         return vertex, slot, *_shown(photo, read_picture(photo, max(1.0, edge_px)), place.pixels, points)
 
-    photos = range(len(sightings.photos))
+    photos = range(len(best_photos.photos))
     for number, (vertex, slot, shown, told) in enumerate(in_order(shown_by, photos, torch.device("cpu"))):
         colour[vertex, slot] = shown
         quality[vertex, slot] *= told
         on_photo((number + 1) / len(photos))
-    return Candidates(sightings.number, sightings.pixels, quality, colour)
+    return Candidates(best_photos.number, best_photos.pixels, quality, colour)
 
 
 def _shown(photo: Photo, picture: Picture, pixels: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

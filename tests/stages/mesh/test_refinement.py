@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from stages.mesh.photos.best_photos import find_best_photos
 from stages.mesh.photos.refinement import refine
-from stages.mesh.photos.sightings import find_sightings
 from tests.stages.mesh.plane_photos import known, ring_of_views, scene_of, sheet, square_camera, write_plane_photos
 
 CAMERA, VOXEL, CELLS = square_camera(200), 0.04, 40
@@ -34,8 +34,8 @@ def refined(tmp_path):
 
         write_plane_photos(tmp_path, CAMERA, views, colours)
         voxels, scene = known(surface, VOXEL), scene_of(CAMERA, views)
-        sightings = find_sightings(surface, scene, tmp_path, {"effects": {}}, voxels, lambda done: None)
-        return refine(surface, sightings, voxels, lambda done: None)
+        best_photos = find_best_photos(surface, scene, tmp_path, {"effects": {}}, voxels, lambda done: None)
+        return refine(surface, best_photos, voxels, lambda done: None)
 
     return run
 

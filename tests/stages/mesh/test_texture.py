@@ -15,8 +15,8 @@ from trimesh.visual.material import PBRMaterial
 from nerf.effects.exposure import expose
 from stages.io.files import write_png
 from stages.mesh.files import ColouredMesh, glb_bytes, obj_files
+from stages.mesh.photos.best_photos import find_best_photos
 from stages.mesh.photos.photo import sampled_picture
-from stages.mesh.photos.sightings import find_sightings
 from stages.mesh.rasteriser import barycentric, covered_pixels
 from stages.mesh.surface import Surface, vertex_normals
 from stages.mesh.texture.atlas import make_atlas
@@ -62,7 +62,7 @@ def baked(tmp_path):
     def bake(surface, scene, effects=None, size=512):
         grey = np.full((len(surface.vertices), 3), GREY, np.uint8)
         field = {"effects": effects or {}}
-        seen = find_sightings(surface, scene, tmp_path, field, known(surface, VOXEL), lambda done: None)
+        seen = find_best_photos(surface, scene, tmp_path, field, known(surface, VOXEL), lambda done: None)
         found = texture_of(surface, grey, seen, size, lambda what, done: None)
         assert found is not None
         atlas, picture = found.texture
@@ -248,7 +248,7 @@ def test_a_photo_that_is_gone_is_named(shoot, baked, tmp_path):
 def test_a_surface_that_no_photo_sees_has_no_texture(shoot, tmp_path):
     turned = sheet(CELLS)._replace(faces=sheet(CELLS).faces[:, ::-1])
     grey = np.full((len(turned.vertices), 3), GREY, np.uint8)
-    seen = find_sightings(turned, shoot(), tmp_path, {"effects": {}}, known(turned, VOXEL), lambda done: None)
+    seen = find_best_photos(turned, shoot(), tmp_path, {"effects": {}}, known(turned, VOXEL), lambda done: None)
     found = texture_of(turned, grey, seen, 64, lambda what, done: None)
     assert found is None
 

@@ -14,10 +14,10 @@ from nerf.geometry.scene import Similarity
 from stages import scale
 from stages.contract import run_stage
 from stages.io.files import read_json, write_json, write_png, write_tensors
-from stages.scale.detection import cells_of, find_markers, locate_corners, luminance
 from stages.scale.lengths import length_in_words, parse_length, parse_point
+from stages.scale.marker_detection import cells_of, find_markers, locate_corners, luminance
 from stages.scale.marker_names import DICTIONARIES, Marker, parse_marker, printed_name
-from stages.scale.square_fit import Sightings, fit_square
+from stages.scale.square_fit import CornerObservations, fit_square
 from tests.stages.scale.marker_scene import CAMERA, Printed, photograph_markers, poses, scene_of
 
 SCENE_FROM_SFM = Similarity(0.4, Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix(), np.array([0.1, 0.2, -0.3]))
@@ -84,7 +84,7 @@ def test_interval_covers_the_scale_when_poses_are_inexact() -> None:
         centres = places[:, :, 3] + rng.normal(0, 0.0015, (len(places), 3))
         turned = rotations.transpose(0, 2, 1)
         from_world = np.concatenate([turned, -turned @ centres[..., None]], axis=2)
-        square = fit_square(Sightings(from_world, np.array(corners), np.full(len(places), 430.0)))
+        square = fit_square(CornerObservations(from_world, np.array(corners), np.full(len(places), 430.0)))
         assert square is not None
         errors.append(square.side / SEVEN.side - 1)
         covered += abs(square.side - SEVEN.side) < 2 * square.standard_error
@@ -100,7 +100,7 @@ def test_edges_are_half_way_in_linear_light_not_in_srgb() -> None:
         corners = [
             locate_corners(light_of(picture), find_markers(picture, "4X4_50")[0], 6, CAMERA) for picture in pictures
         ]
-        square = fit_square(Sightings(from_world, np.array(corners), np.full(len(places), 430.0)))
+        square = fit_square(CornerObservations(from_world, np.array(corners), np.full(len(places), 430.0)))
         assert square is not None
         return square.side / SEVEN.side - 1
 

@@ -12,7 +12,7 @@ from nerf.geometry.scene import Camera
 from stages.ingest.orientation import QUARTER_TURNS
 from stages.io.photos import Photo
 from stages.sfm.colmap.cameras import native
-from stages.sfm.colmap.known_cameras import known_cameras
+from stages.sfm.colmap.given_intrinsics import given_intrinsics
 
 FOCAL_GUESS = 1.2  # focal length over the longer side where EXIF is silent: 45 degrees, a phone's main camera
 MAPPING_MODEL = "SIMPLE_RADIAL"  # one focal length and one distortion term hold with few matches
@@ -41,12 +41,12 @@ def fill_database(
 ) -> None:
     """Enter photos (in order of ``file``) and their cameras, all or nothing: one for each camera group with ``turns``,
     and one for each way in which it was held without. Of known ``camera_params`` all photos have their camera
-    (known_cameras.py)."""
+    (given_intrinsics.py)."""
     with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
         if db.num_images():
             return
         camera_ids: dict[tuple[int, int | None] | Camera, int] = {}
-        known = known_cameras(photos, camera_model, camera_params) if camera_params else [None] * len(photos)
+        known = given_intrinsics(photos, camera_model, camera_params) if camera_params else [None] * len(photos)
         for image_id, (photo, given) in enumerate(zip(photos, known, strict=True), start=1):
             group = given or (photo.camera_group, None if turns else photo.orientation)
             if group not in camera_ids:

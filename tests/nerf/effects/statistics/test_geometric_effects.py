@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerf.effects.statistics.background import background_statistic, untracked_share
-from nerf.effects.statistics.poses import common_residuals, pose_statistic
+from nerf.effects.statistics.pose_refinement import common_residuals, pose_statistic
 from nerf.effects.statistics.tracks import TrackColours
 from nerf.effects.statistics.warnings import (
     across_rows,

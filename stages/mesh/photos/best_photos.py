@@ -31,7 +31,7 @@ BORDER = 0.03  # of a photo's smaller side: from there on to its edge a photo co
 NORMAL_STEPS = 3  # over neighbours
 
 
-class Sightings(NamedTuple):
+class BestPhotos(NamedTuple):
     """The best ``photos`` of each vertex, (n, KEPT_PHOTOS): their ``number``, their sharp ``pixels`` per unit of area,
     their ``quality`` (these, less where a photo tells less; 0: none) and whether they show the surface ``whole``:
     nothing nearer or farther within a voxel of the vertex. ``means``: :func:`neighbour_means`."""
@@ -49,7 +49,7 @@ class Sightings(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """How one photo shows the vertices, (n,) each, as in :class:`Sightings`."""
+    """How one photo shows the vertices, (n,) each, as in :class:`BestPhotos`."""
 
     pixels: np.ndarray
     quality: np.ndarray
@@ -76,20 +76,20 @@ def smooth_normals(surface: Surface, means: csr_array) -> np.ndarray:
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
-def find_sightings(
+def find_best_photos(
     surface: Surface,
     scene: Scene,
     ingest: Path,
     field: dict[str, Any],
     voxels: VoxelLengths,
     on_photo: Callable[[float], None],
-) -> Sightings:
+) -> BestPhotos:
     """The best training photos of every vertex. ``field``: the content of field.json; ``voxels``: how well the surface
     is known where. Masks lie in the folder of stage ``ingest``."""
     photos, means = photos_of(scene, ingest, field), neighbour_means(surface)
     shape = len(surface.vertices), min(KEPT_PHOTOS, len(photos))
     arrays = (np.zeros(shape, kind) for kind in (np.int32, np.float32, np.float32, bool))
-    kept = Sightings(photos, means, *arrays)
+    kept = BestPhotos(photos, means, *arrays)
     normals = smooth_normals(surface, means)
 
     def seen_by(photo: Photo) -> Sight:
@@ -147,7 +147,7 @@ def _visible(
     return ~within(1, nearer=True), within(margin + 1, nearer=True), whole
 
 
-def _keep_best(kept: Sightings, number: int, sight: Sight) -> None:
+def _keep_best(kept: BestPhotos, number: int, sight: Sight) -> None:
     """Put a photo in the place of the worst one of each vertex that it is better at."""
     vertex = np.flatnonzero(sight.quality)
     slot = kept.quality[vertex].argmin(axis=1)

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from nerf.geometry.scene import Camera
 from stages import render
 from stages.render.path import even_height
-from stages.render.plan import choose_frames_and_width, default_fps, max_useful_side
+from stages.render.planning import choose_frames_and_width, default_fps, max_useful_side
 
 LANDSCAPE = Camera("PINHOLE", 1600, 1000, (1500.0, 1500.0, 800.0, 500.0))
 PORTRAIT = Camera("PINHOLE", 1000, 1600, (1500.0, 1500.0, 500.0, 800.0))

@@ -12,7 +12,7 @@ from stages.sfm.imported.orientation import same_shape
 MAX_OFF_CENTRE = 0.1  # of a size, that a principal point may be off its middle: lenses are centred to a percent or two
 
 
-def known_cameras(photos: Sequence[Photo], model: str, params: Sequence[float]) -> list[Camera | None]:
+def given_intrinsics(photos: Sequence[Photo], model: str, params: Sequence[float]) -> list[Camera | None]:
     """The camera of each photo, None of those of another shape than the one that has these parameters.
 
     They belong to the size, of a photo or of one that is turned, whose middle is nearest to the principal point. EXIF
