@@ -98,7 +98,7 @@ def plot(rows: list[dict[str, Any]], file: Path) -> None:
     each = rows[0]["sfm_seconds"] / rows[0]["photos"]
     axes.loglog(photos, [each * count for count in photos], "k:", label="∝ photos")
     axes.set(xlabel="photos", ylabel="seconds")
-    axes.legend(fontsize=8)
+    figure.legend(loc="outside right upper", fontsize=8)
     figure.savefig(file, dpi=110)
 
 
