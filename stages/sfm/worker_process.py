@@ -60,8 +60,9 @@ def run_worker(
             text = f"going on without the retry strategy {latest['strategy']!r}, because {ended.why}. Log: {log}"
             progress.note("sfm.strategy-crashed", text)
             continue
-        limit = config.max_seconds if late else None
-        raise _worker_failed(status, limit, latest["phase"], latest.get("fault") or _last_line(log), log)
+        if late:
+            raise _timeout(config.max_seconds, latest, skipped=ended is not None)
+        raise _worker_failed(status, latest["phase"], latest.get("fault") or _last_line(log), log)
 
 
 def _run_once(job: dict[str, Any], log: Path, photos: int, progress: Progress) -> tuple[int, bool, dict[str, Any]]:
@@ -78,7 +79,8 @@ def _run_once(job: dict[str, Any], log: Path, photos: int, progress: Progress) -
             progress.update(*_describe(latest, photos))
 
     with live_line(progress, lambda: _describe(latest, photos)):
-        return *run_child(COMMAND, log, job, job["max_seconds"], hear), latest
+        status, late = run_child(COMMAND, log, job, job["max_seconds"], hear)
+    return status, late, latest
 
 
 class Ending(NamedTuple):
@@ -183,26 +185,31 @@ def _disk_is_full(log: Path) -> bool:
     return shutil.disk_usage(log.parent).free < MIN_FREE_BYTES
 
 
-def _worker_failed(status: int, limit: float | None, phase: str, last: str, log: Path) -> StageError:
+def _timeout(limit: float, latest: Mapping[str, Any], skipped: bool) -> StageError:
+    """``skipped``: whether the strategy at work will not be tried again."""
+    hint = "Raise --sfm.max-seconds, or give fewer photos; the matches found so far are kept."
+    if skipped:
+        hint = f"Run again: the strategy {latest['strategy']!r} is then skipped."
+    what = f"structure from motion was stopped {_while(latest['phase'])}"
+    return StageError("sfm.timeout", what, f"it took longer than {limit:g} s", hint)
+
+
+def _worker_failed(status: int, phase: str, last: str, log: Path) -> StageError:
     """``last``: the last message of the worker."""
     if _disk_is_full(log):
         last += f"; the disk is full, with {shutil.disk_usage(log.parent).free / 2**20:.1f} MB free"
-    where = f"while {phase}" if phase != "features" else "while extracting features"
-    if limit is not None:
-        return StageError(
-            "sfm.timeout",
-            f"structure from motion was stopped {where}",
-            f"it took longer than {limit:g} s",
-            "Raise --sfm.max-seconds, or give fewer photos; the matches found so far are kept. A retry strategy that "
-            "ran out of time is skipped the next time.",
-        )
     if status < 0:
         name = signal.Signals(-status).name
         memory = status == -signal.SIGKILL
         return StageError(
             "sfm.worker-killed",
-            f"structure from motion was killed by {name} {where}",
+            f"structure from motion was killed by {name} {_while(phase)}",
             "the machine most likely ran out of memory" if memory else f"COLMAP crashed ({last})",
             f"Run again: the matches are kept. To use less memory: --sfm.max-features 2048. Log: {log}",
         )
-    return StageError("sfm.worker-failed", f"structure from motion failed {where}", last, f"The whole log is in {log}")
+    what = f"structure from motion failed {_while(phase)}"
+    return StageError("sfm.worker-failed", what, last, f"The whole log is in {log}")
+
+
+def _while(phase: str) -> str:
+    return f"while {phase}" if phase != "features" else "while extracting features"
