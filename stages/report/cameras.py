@@ -112,7 +112,7 @@ def _doubts_of_global_mapping(comparison: Mapping[str, Any] | None) -> list[str]
 
 
 def _disagrees(comparison: Mapping[str, Any] | None) -> TypeGuard[Mapping[str, Any]]:
-    return _differs(comparison) and not _is_refuted(comparison)
+    return _differs(comparison) and not comparison["drift"] and not _is_refuted(comparison)
 
 
 def _differs(comparison: Mapping[str, Any] | None) -> TypeGuard[Mapping[str, Any]]:
@@ -159,6 +159,10 @@ def _figures(registration: Mapping[str, Any]) -> str | None:
         name = "incremental" if comparison["taken"] else "global"
         support = f"{comparison['agreeing_other']:,} of their image pairs agree with it and {comparison['agreeing']:,}"
         said.append(f"{name} mapping gives {counted(len(comparison['different']))} other poses; {support} with these")
+    elif _differs(comparison) and comparison["drift"]:
+        name = "incremental" if comparison["taken"] else "global"
+        bent = f"against {name} mapping the path is bent or stretched at {counted(len(comparison['different']))}"
+        said.append(f"{bent}, little by little: no loop tells which is right")
     elif comparison and not comparison["failed"] and comparison["centre"] is not None:
         same = f"{comparison['agree']} of {comparison['photos']} photos the same pose"
         extent = f"{max(comparison['centre'], MIN_SHOWN):.2%} of the extent"

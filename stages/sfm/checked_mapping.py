@@ -23,11 +23,12 @@ from stages.sfm.colmap.model_check import (
     better,
     check_model,
     fragments_sequence,
+    pairs_agreeing_with_both,
     reasons,
     supported_runs,
     supported_steps,
 )
-from stages.sfm.colmap.model_comparison import compare_models, disagree
+from stages.sfm.colmap.model_comparison import compare_models, differ_by_drift, disagree
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import copy_consistent_matches, deregister, drop_outside_main_segment, register_again
 from stages.sfm.extraction_and_matching import capture_sequence, consecutive_pairs
@@ -232,11 +233,13 @@ def _comparison(checked: CheckedModel, incremental: Any, other: Any, database: P
     """How the models of ``incremental`` and global mapping (``other``) compare, the one that was taken first; and where
     they differ, how many verified pairs agree with either."""
     taken, rejected = checked.model, incremental if checked.model is other else other
-    compared = compare_models(taken, rejected) | {"failed": None, "agreeing": None, "agreeing_other": None}
+    compared = compare_models(taken, rejected) | {"failed": None, "drift": False}
+    compared |= {"agreeing": None, "agreeing_other": None}
     if compared["different"]:
         known = {id(one.model): one for one in checked.candidates}
         first, second = (known.get(id(one)) or _candidate(one, database, state) for one in (taken, rejected))
         compared["agreeing"], compared["agreeing_other"] = agreeing_pairs(first, second, compared["different"])
+        compared["drift"] = differ_by_drift(taken, rejected, pairs_agreeing_with_both(first, second))
     return compared | {"taken": taken is other}
 
 

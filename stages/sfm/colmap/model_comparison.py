@@ -1,11 +1,13 @@
 """In which images two models differ, and how far they agree. Call it in a worker process."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import pycolmap
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from nerf.geometry.alignment import align
 from stages.sfm.degeneracy import different_poses
@@ -13,6 +15,9 @@ from stages.sfm.degeneracy import different_poses
 # A single image may merely have a bad pose in one of two models: it takes several to say that the models contradict.
 MIN_DIFFERENT, MIN_DIFFERENT_FRACTION = 2, 0.2
 MAX_DIFFERENT_FRACTION = 0.05  # of the images that two models share, whose poses may differ
+# Between two images of a verified pair: a fifth of the angle at which poses are called different, and a scale that no
+# single step of a sound path changes by.
+MAX_STEP_DEG, MAX_STEP_SCALE = 1.0, 1.1
 
 
 def find_conflict(models: Sequence[pycolmap.Reconstruction]) -> dict[str, Any] | None:
@@ -73,6 +78,34 @@ def disagree(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> 
     """Whether two models of the same images give more than a few of them different poses."""
     compared = compare_models(model, other)
     return len(compared["different"]) > MAX_DIFFERENT_FRACTION * compared["photos"]
+
+
+def differ_by_drift(
+    model: pycolmap.Reconstruction, other: pycolmap.Reconstruction, pairs: Collection[tuple[int, int]]
+) -> bool:
+    """Whether two models differ by drift alone: what small differences add up to along a path, which only a loop
+    could tell. Then pairs (image ids) whose relative poses are alike in both link nearly all the images they share. A
+    group that has another place in one of them is linked to the rest by none."""
+    shared = sorted({*model.reg_image_ids()} & {*other.reg_image_ids()})
+    number = {image_id: i for i, image_id in enumerate(shared)}
+    ends = np.array([[number[i], number[j]] for i, j in pairs if i in number and j in number], int).reshape(-1, 2)
+    if not len(ends):
+        return False
+    turns, steps = [], []
+    for of in (model, other):
+        poses = np.array([of.image(i).cam_from_world().inverse().matrix() for i in shared])[ends]
+        turns.append(poses[:, 0, :, :3].transpose(0, 2, 1) @ poses[:, 1, :, :3])
+        steps.append(np.linalg.norm(poses[:, 0, :, 3] - poses[:, 1, :, 3], axis=1))
+    cosine = (np.einsum("nij,nij->n", *turns) - 1) / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        stretched = np.log(steps[1] / steps[0])
+    # Of each image's steps together: the length of a single short one is uncertain.
+    scale = np.array([np.median(stretched[(ends == i).any(axis=1)]) for i in np.unique(ends)])
+    at = np.searchsorted(np.unique(ends), ends)
+    alike = (cosine > np.cos(np.radians(MAX_STEP_DEG))) & (np.abs(np.diff(scale[at])[:, 0]) < np.log(MAX_STEP_SCALE))
+    graph = coo_array((np.ones(alike.sum()), ends[alike].T), shape=(len(shared), len(shared)))
+    largest = np.bincount(connected_components(graph, directed=False)[1]).max()
+    return bool(largest >= (1 - MAX_DIFFERENT_FRACTION) * len(shared))
 
 
 def _poses(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:

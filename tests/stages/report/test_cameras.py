@@ -37,7 +37,7 @@ def check(**changed: Any) -> dict[str, Any]:
 
 def opinion(**changed: Any) -> dict[str, Any]:
     agree = {"photos": PHOTOS, "agree": PHOTOS, "different": [], "centre": 0.0006, "degrees": 0.02, "failed": None}
-    return agree | {"agreeing": 100, "agreeing_other": 100, "taken": False} | changed
+    return agree | {"agreeing": 100, "agreeing_other": 100, "taken": False, "drift": False} | changed
 
 
 def weak(*counts: int) -> list[dict[str, Any]]:
@@ -86,6 +86,7 @@ def test_each_kind_of_doubt_makes_the_cameras_doubtful(changed: dict[str, Any], 
         ({"check": check(sequence_breaks=[[file, file] for file in files(3)])}, 1),
         ({"global_mapping": opinion(different=files(3))}, 0),
         ({"global_mapping": opinion(different=files(40), agreeing_other=89)}, 0),
+        ({"global_mapping": opinion(different=files(40), drift=True)}, 0),
         ({"global_mapping": {"failed": "global mapping found no model"}}, 0),
     ],
 )
