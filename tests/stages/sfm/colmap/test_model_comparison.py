@@ -90,7 +90,8 @@ def test_drift_is_what_small_steps_add_up_to(
         images = [SparseImage(f"{number:02d}.png", 0, pose) for number, pose in poses.items()]
         write_model(tmp_path / name, SparseModel.without_points([CAMERA], images))
         models.append(load_native(tmp_path / name))
-    ids = {models[0].image(image_id).name: image_id for image_id in models[0].reg_image_ids()}
+    first, second = models
+    ids = {first.image(image_id).name: image_id for image_id in first.reg_image_ids()}
     # Each photo has pairs with the next two; ``without``: no pair crosses the step to this one.
     pairs = {
         (ids[f"{i:02d}.png"], ids[f"{j:02d}.png"])
@@ -98,6 +99,6 @@ def test_drift_is_what_small_steps_add_up_to(
         for j in range(i + 1, min(i + 3, ROW))
         if not any(i < at <= j for at in without)
     }
-    assert len(compare_models(*models)["different"]) > 3
-    assert differ_by_drift(*models, pairs) == drift
-    assert not differ_by_drift(*models, set())
+    assert len(compare_models(first, second)["different"]) > 3
+    assert differ_by_drift(first, second, pairs) == drift
+    assert not differ_by_drift(first, second, set())
