@@ -67,8 +67,8 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
-    """Render the test photos, compare, and write metrics.json, renders/ and errors/; where there are depth maps, compare
-    with these, too."""
+    """Render the test photos, compare, and write metrics.json, renders/ and errors/; where there are depth maps,
+    compare with these, too."""
     from stages.evaluate.scoring import load, save, score
 
     scorer = load(config, inputs, progress)

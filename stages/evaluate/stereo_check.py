@@ -33,14 +33,23 @@ RECORD, PICTURES = "stereo_check.json", "stereo_check"
 SIGMAS, MIN_DIFFERENCE = 3.0, 0.03  # a pixel differs by more than so many standard deviations, and by more than 3 %
 PIXELS = 2048  # of a photo: they tell the share that differs to 1 %
 SHOWN = 2  # photos in which most pixels differ
-MIN_SHOWN_PIXELS, MAX_SHOWN_PIXELS = 160 * 120, 400 * 300  # of each panel of their pictures
+MIN_SHOWN_PIXELS, MAX_SHOWN_PIXELS = 48 * 36, 400 * 300  # of each panel of their pictures
 GAP = 4  # white pixels between panels
-NEARER, FARTHER, UNKNOWN = (225, 29, 72), (59, 130, 246), (128, 128, 128)  # colours: the field is so; stereo does not know
+NEARER, FARTHER = (225, 29, 72), (59, 130, 246)  # colours where the field is so
+UNKNOWN = (128, 128, 128)  # and where stereo sees nothing
+
+
+class Known(NamedTuple):
+    """Rays, how far along them stereo sees a surface (scene units; 0: it does not know, or the field could not show
+    it), and by which fraction of that the field may differ."""
+
+    rays: Rays
+    distance: Float[Tensor, "*rays"]
+    tolerance: Float[Tensor, "*rays"]
 
 
 class Compared(NamedTuple):
-    """Distances along rays by stereo (0: not known, or nothing that the field could show) and by the field, in scene
-    units, and by which fraction they may differ."""
+    """Distances along rays by stereo (0: not known) and by the field, and by which fraction they may differ."""
 
     stereo: Float[Tensor, "*rays"]
     field: Float[Tensor, "*rays"]
@@ -85,31 +94,40 @@ class StereoCheck:
         """Photo width / width of its depth map."""
         return read_json(self.depth / "depth.json")["downscale"]
 
-    def sample(self, view: View, number: int) -> Compared:
+    def sample(self, view: View, number: int) -> Known:
         """PIXELS random ones of those that stereo knows in the ``number``-th photo, or all of them, (1, n)."""
-        rays, stereo, tolerance = self._stereo(view, self.downscale)
-        known = stereo.flatten().nonzero().squeeze(-1)
-        some = known[torch.randperm(len(known), generator=generator("cpu", number))[:PIXELS]]
-        rays, stereo, tolerance = (
-            rays.each(lambda part: part.flatten(0, 1)[some][None]),
-            stereo.flatten()[some][None],
-            tolerance.flatten()[some][None],
-        )
-        return Compared(stereo, rendered_distance(self.renderer, rays) if len(some) else stereo, tolerance)
+        known = self._known(view, self.downscale)
+        pixels = known.distance.flatten().nonzero().squeeze(-1)
+        some = pixels[torch.randperm(len(pixels), generator=generator("cpu", number))[:PIXELS]]
+        distance, tolerance = (part.flatten()[some][None] for part in known[1:])
+        return Known(known.rays.each(lambda part: part.flatten(0, 1)[some][None]), distance, tolerance)
 
     def picture(self, view: View, pixels: float) -> np.ndarray:
-        """Photo, stereo's depth, the field's, and where they differ, side by side, each of about so many ``pixels``, at
-        most those of the depth map."""
+        """Photo, where depths differ, stereo's and the field's, each of about so many ``pixels``, at most those of the
+        depth map."""
         camera = self.scene.cameras[view.camera]
         downscale = max(self.downscale, math.sqrt(camera.width * camera.height / pixels))
-        rays, stereo, tolerance = self._stereo(view, downscale)
-        compared = Compared(stereo, rendered_distance(self.renderer, rays), tolerance)
+        compared = self.compare(self._known(view, downscale))
         background = self.renderer.background.tolist()
         photo = PhotoReader(self.ingest, self.scene, downscale).pixels(view, background).mul(255).byte().numpy()
-        return _side_by_side(photo, compared)
+        return _panels(photo, compared)
 
-    def _stereo(self, view: View, downscale: float) -> tuple[Rays, Tensor, Tensor]:
-        """The rays of a photo at this size, what stereo knows of their distances, and how far the field's may be off."""
+    def compare(self, known: Known) -> Compared:
+        """What stereo knows beside what the field shows: the expected distance of what stops the rays, whatever they
+        transmit; their far end where that is more than half.
+
+        Each kind of field renders the expected distance; by the median one hardly other pixels differ
+        (docs/stages/evaluate.md).
+        """
+        rays = known.rays
+        if not rays.near.numel():
+            return Compared(known.distance, rays.far, known.tolerance)
+        _, depth, opacity = self.renderer.render(rays)
+        stopped = (depth - (1 - opacity) * rays.far) / opacity.clamp(min=0.5)
+        return Compared(known.distance, torch.where(opacity > 0.5, stopped, rays.far), known.tolerance)
+
+    def _known(self, view: View, downscale: float) -> Known:
+        """What stereo knows of a photo at this size."""
         rays = view_rays(self.scene, view, downscale)
         depth_map = read_depth_map(depth_map_file(self.depth, view.file))
         rows, columns = (  # of the depth map, at the middles of these pixels
@@ -121,45 +139,36 @@ class StereoCheck:
         field = self.renderer.field
         if isinstance(field, HashGridField) and not field.space.unbounded:  # nothing is rendered outside the box
             shown &= (points_on(rays, distance[..., None]).squeeze(-2).abs() <= field.space.half).all(-1)
-        return rays, distance * shown, (SIGMAS * sigma).clamp(min=MIN_DIFFERENCE)
-
-
-def rendered_distance(renderer: Renderer, rays: Rays) -> Float[Tensor, "h w"]:
-    """Expected distance of what stops rays (h, w), whatever they transmit; their far end where that is more than half.
-
-    The expected distance is what each kind of field renders.
-    """
-    rendering = renderer.render(rays)
-    stopped = rendering.depth - (1 - rendering.opacity) * rays.far
-    return torch.where(rendering.opacity > 0.5, stopped / rendering.opacity.clamp(min=0.5), rays.far)
+        return Known(rays, distance * shown, (SIGMAS * sigma).clamp(min=MIN_DIFFERENCE))
 
 
 def check(
     scene: Scene, inputs: Inputs, renderer: Renderer, seconds: float, folder: Path, progress: Progress
 ) -> dict[str, Any]:
-    """Compare the field with the depth maps, in about so many ``seconds``, and write the content of the answer, RECORD,
-    and pictures below PICTURES. Photos that there is no time for are left out, evenly; one is always compared."""
+    """Compare the field with the depth maps, in about so many ``seconds``. Writes RECORD, whose content it returns, and
+    PICTURES. Photos that there is no time for are left out, evenly; one is always compared."""
     one = StereoCheck(scene, inputs["ingest"], inputs["depth"], renderer)
-    views, began = scene.of_split("train"), time.perf_counter()
+    views, began, rendering = scene.of_split("train"), time.perf_counter(), 0.0
     found = dict[int, Compared]()
     for number in sorted(range(len(views)), key=lambda index: index * GOLDEN_RATIO % 1):
-        progress.update(f"comparing depth with stereo in {views[number].name}", len(found) / len(views))
-        found[number] = one.sample(views[number], number)
+        progress.update(f"comparing depth with stereo, photo {len(found) + 1} of {len(views)}")
+        known, clock = one.sample(views[number], number), time.perf_counter()
+        found[number] = one.compare(known)
+        rendering += time.perf_counter() - clock
         if time.perf_counter() - began > seconds / 2:
             break
     images = {number: {"name": views[number].name} | found[number].figures() for number in sorted(found)}
     overall = Compared(*(torch.cat(parts, dim=1) for parts in zip(*found.values(), strict=True))).figures()
-    spent = time.perf_counter() - began
-    affordable = overall["pixels"] / spent * (seconds - spent) / SHOWN
-    worst = sorted((n for n in images if images[n]["pixels"]), key=lambda n: -images[n]["differ"])[:SHOWN]
+    differing = [number for number, image in images.items() if image["differ"]]
+    worst = sorted(differing, key=lambda n: -images[n]["differ"] * images[n]["pixels"])[:SHOWN]
+    affordable = overall["pixels"] / rendering * (seconds - (time.perf_counter() - began)) / SHOWN
     (folder / PICTURES).mkdir()
     for number in worst:
         file = Path(views[number].file.removeprefix("images/")).with_suffix(".png").as_posix()
         picture = one.picture(views[number], min(max(affordable, MIN_SHOWN_PIXELS), MAX_SHOWN_PIXELS))
         write_png(folder / PICTURES / file, picture)
         images[number]["picture"] = f"{PICTURES}/{file}"
-    result = {"photos_compared": len(found), "photos_train": len(views)} | overall
-    result |= {"tolerance": {"sigmas": SIGMAS, "fraction": MIN_DIFFERENCE}}
+    result = {"photos_compared": len(found), "photos_train": len(views), "min_difference": MIN_DIFFERENCE} | overall
     result |= {"images": list(images.values()), "worst": [views[number].name for number in worst]}
     write_json(folder / RECORD, result)
     return result
@@ -174,17 +183,21 @@ def line_of(result: dict[str, Any]) -> str:
     return f"depth differs from stereo at {result['differ']:.1%} of the pixels that it covers{of_photos}"
 
 
-def _side_by_side(photo: np.ndarray, compared: Compared) -> np.ndarray:
-    """Four panels (h, w, 3) uint8 in a row. Depths are inverse ones, near red, far blue (turbo), on the scale of stereo's
-    from its 1 % to its 99 % quantile. In the last one covered pixels are bright, and those that differ are coloured."""
+def _panels(photo: np.ndarray, compared: Compared) -> np.ndarray:
+    """Four panels (h, w, 3) uint8: the photo beside where depths differ, below them the depths of stereo and field.
+
+    Depths are inverse ones, near red, far blue (turbo), on the scale of stereo's from its 1 % to its 99 % quantile.
+    Where they differ is coloured, what is compared is bright.
+    """
     known = (compared.stereo > 0).numpy()
     inverse = [1 / each.double().clamp(min=1e-6).numpy() for each in (compared.stereo, compared.field)]
     low, high = np.quantile(inverse[0][known] if known.any() else inverse[1], [0.01, 0.99])
     levels = [np.clip((each - low) / ((high - low) or 1), 0, 1) for each in inverse]
     stereo, field = (colormaps["turbo"](level, bytes=True)[..., :3] for level in levels)
-    grey = photo.mean(-1, keepdims=True)
-    differs = np.broadcast_to(np.where(known[..., None], 100 + 0.6 * grey, 0.3 * grey), photo.shape).copy()
+    stereo[~known] = UNKNOWN
+    grey = photo.mean(-1, keepdims=True).repeat(3, axis=-1)
+    differs = np.where(known[..., None], 100 + 0.6 * grey, 0.3 * grey)
     differs[compared.nearer.numpy()], differs[compared.farther.numpy()] = NEARER, FARTHER
-    gap = np.full((len(photo), GAP, 3), 255)
-    panels = [photo, gap, np.where(known[..., None], stereo, UNKNOWN), gap, field, gap, differs]
-    return np.concatenate(panels, axis=1).astype(np.uint8)
+    beside = np.full((len(photo), GAP, 3), 255)
+    above, below = (np.hstack([left, beside, right]) for left, right in ((photo, differs), (stereo, field)))
+    return np.vstack([above, np.full((GAP, above.shape[1], 3), 255), below]).astype(np.uint8)
