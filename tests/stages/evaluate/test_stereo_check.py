@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +13,20 @@ from PIL import Image
 from torch import Tensor
 
 from nerf import REGION_HALF_SIZE
-from nerf.fields.hash_grid import HashGridField, HashGridSettings
+from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from nerf.geometry.space_maps import Box, Contraction, SpaceMap
+from nerf.kernels import torch as reference
 from stages import depth, evaluate
 from stages.contract import Inputs, StageResult, run_stage
 from stages.depth.files import depth_map_file, read_depth_map
 from stages.evaluate import stereo_check
 from stages.evaluate.stereo_check import FARTHER, GAP, NEARER, Compared, Known, StereoCheck, check
-from stages.hardware.backend import chosen_backend, load_backend
 from stages.io.files import read_scene, write_json
 from stages.render.renderer import Renderer
 from tests.conftest import RecordedProgress
+from tests.nerf.hash_grid_fields import SMALL
 from tests.stages.depth.walls import Wall, WallScene, cameras_before, wall
 
 BACK, FRONT = wall((0, 1.0, 0), (3, 2), 10, seed=1), wall((0.1, -0.3, 0), (0.35, 0.3), -10, seed=2)
@@ -180,8 +182,7 @@ def test_uncertain_stereo_allows_larger_differences():
 
 @pytest.mark.parametrize("space", [Box(), Contraction()])
 def test_what_lies_outside_a_box_is_not_compared(space: SpaceMap, inputs: Inputs):
-    sizes = {"num_levels": 2, "log2_hashmap_size": 8, "base_res": 4, "max_res": 16, "occupancy_resolution": 8}
-    field = HashGridField(HashGridSettings(space=space, **sizes), 5, load_backend(chosen_backend("cpu"), "cpu"))
+    field = HashGridField(replace(SMALL, space=space), 5, reference)
     scene = read_scene(inputs["normalise"])
     view = scene.of_split("train")[0]
     one = StereoCheck(scene, inputs["ingest"], inputs["depth"], Renderer(field, torch.zeros(3)))

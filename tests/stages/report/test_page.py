@@ -180,7 +180,7 @@ def test_depth_beside_stereo_is_shown_where_it_is_known(supervised: bool, tmp_pa
     title = "<h2>Depth beside stereo</h2>"
     assert title not in without and html.count(title) == 1
     section = html.partition(title)[2].partition("</section>")[0]
-    for figure in ("At 8.3% of", "nearer at 5.1%", "farther at 3.2%", "is 0.93%", "8,192 random pixels of 5 of 18 "):
+    for figure in ("At 8.31% of", "nearer at 5.14%", "farther at 3.17%", "is 0.93%", "8,192 random pixels of 5 of 18 "):
         assert figure in section
     assert section.count('src="data:image/jpeg;base64,') == 2
     assert section.count("<tr><td>") == 5 and '<td class="number">0</td><td class="number">–</td>' in section
