@@ -157,8 +157,10 @@ def check(
         rendering += time.perf_counter() - clock
         if time.perf_counter() - began > seconds / 2:
             break
-    images = {number: found[number].figures() | {"name": views[number].name} for number in sorted(found)}
+    images = {number: found[number].figures() for number in sorted(found)}
     overall = Compared(*(torch.cat(parts, dim=1) for parts in zip(*found.values(), strict=True))).figures()
+    for number, image in images.items():
+        image["name"] = views[number].name
     differing = [number for number, image in images.items() if image["differ"]]
     worst = sorted(differing, key=lambda n: -images[n]["differ"] * images[n]["pixels"])[:SHOWN]
     affordable = overall["pixels"] / rendering * (seconds - (time.perf_counter() - began)) / SHOWN
