@@ -5,6 +5,7 @@ there is no time for all of it, in tiles. PSNR is taken from the float image in 
 photos are means of the photos' own.
 """
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -66,20 +67,29 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
-    """Render the test photos, compare, and write metrics.json, renders/ and errors/."""
+    """Render the test photos, compare, and write metrics.json, renders/ and errors/; where there are depth maps,
+    compare with these, too."""
     from stages.evaluate.scoring import load, save, score
 
     scorer = load(config, inputs, progress)
     images = score(scorer, folder, progress, partial(load, config, dict(inputs), SilentProgress()))
-    return save(scorer, images, folder)
+    result = save(scorer, images, folder)
+    if "depth" not in inputs:
+        return result
+    from stages.evaluate.planning import stereo_seconds
+    from stages.evaluate.stereo_check import PICTURES, RECORD, check, line_of
+
+    checked = check(scorer.scene, inputs, scorer.renderer, stereo_seconds(config, inputs["train"]), folder, progress)
+    return replace(result, records=(RECORD, PICTURES), line=f"{result.line} · {line_of(checked)}")
 
 
 STAGE = Stage(
     name="evaluate",
     inputs=("ingest", "normalise", "train"),
+    optional_inputs=("depth",),
     version=19,
     exit_code=15,
-    published=("metrics.json", "renders", "errors"),
+    published=("metrics.json", "renders", "errors", "stereo_check.json", "stereo_check"),
     config=Config,
     not_hashed=("seconds",),  # it decides how much of the photos is scored, and that enters the key
     plan=plan,

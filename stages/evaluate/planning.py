@@ -1,13 +1,14 @@
 """How much of each test photo there is time to score on this machine."""
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerf.geometry.rays import Rays, join_rays
 from nerf.geometry.scene import Scene
 from stages.contract import Inputs, Progress
 from stages.evaluate.scoring import fits_poses
-from stages.evaluate.seconds import MIN_RENDERING, SHARE, other_seconds
+from stages.evaluate.seconds import MIN_RENDERING, SHARE, STEREO_SHARE, other_seconds
 from stages.evaluate.tiles import PREVIEW_SHARE
 from stages.hardware.device import cores
 from stages.io.amounts import counted, duration, short_count
@@ -46,6 +47,11 @@ def affordable_fraction(config: "Config", inputs: Inputs, progress: Progress) ->
             f"{short_count(speed)} rays/s, {time_budget.message()}; --evaluate.fraction 1 scores all",
         )
     return fraction
+
+
+def stereo_seconds(config: "Config", train: Path) -> float:
+    """How long comparing depth with stereo may take, on top of what scoring may."""
+    return STEREO_SHARE * TimeBudget(config.seconds, train, 0.0, SHARE, MIN_RENDERING).seconds_left()
 
 
 def _rounded_down(affordable: float, with_preview: float) -> float:

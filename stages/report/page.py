@@ -90,6 +90,7 @@ class Results:
     curve: dict[str, Any] | None
     profile: dict[str, Any] | None
     metrics: dict[str, Any] | None
+    stereo_check: dict[str, Any] | None
     study: dict[str, Any] | None
 
 
@@ -100,6 +101,9 @@ def read_results(inputs: Inputs, stages: Sequence[str]) -> Results:
     def of(stage: str, name: str) -> Any:
         return read_json(inputs[stage] / name) if stage in inputs else None
 
+    def if_there(stage: str, name: str) -> Any:
+        return of(stage, name) if stage in inputs and (inputs[stage] / name).exists() else None
+
     return Results(
         inputs=inputs,
         manifests={stage: of(stage, "manifest.json") for stage in stages if stage in inputs and stage != "tradeoff"},
@@ -109,10 +113,9 @@ def read_results(inputs: Inputs, stages: Sequence[str]) -> Results:
         effects=of("effects", "effects.json"),
         field=of("train", "field.json"),
         curve=of("train", "curve.json"),
-        profile=of("train", "profile.json")
-        if "train" in inputs and (inputs["train"] / "profile.json").exists()
-        else None,
+        profile=if_there("train", "profile.json"),
         metrics=of("evaluate", "metrics.json"),
+        stereo_check=if_there("evaluate", "stereo_check.json"),
         study=of("tradeoff", "tradeoff.json"),
     )
 
@@ -179,6 +182,7 @@ def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
         metrics=results.metrics,
         scored_on=scored_on(results.metrics) if results.metrics and results.metrics["images"] else None,
         compared=(compared := _compared(results)),
+        stereo=_stereo(results),
         opening=_opening(results, compared),
         mesh_figures=_mesh_figures(results.manifests.get("mesh", {}).get("facts", {})),
         video=_video(results.inputs, config.video_limit_mb),
@@ -375,6 +379,19 @@ def _compared(results: Results) -> dict[str, Any] | None:
         "small": [_pictures(results, ranked[rank], WIDTH_SMALL) for rank in small],
         "ranked": ranked,
     }
+
+
+def _stereo(results: Results) -> dict[str, Any] | None:
+    """How the field's depth compares with stereo's, with pictures of the photos in which it differs most; None where
+    nothing was compared."""
+    found = results.stereo_check
+    if found is None or not found["pixels"]:
+        return None
+    images = {image["name"]: image for image in found["images"]}
+    files = {name: results.inputs["evaluate"] / images[name]["picture"] for name in found["worst"]}
+    pictures = [images[name] | {"uri": jpeg_uri(Image.open(file))} for name, file in files.items()]
+    supervised = results.manifests.get("train", {}).get("config", {}).get("depth", False)
+    return found | {"pictures": pictures, "supervised": supervised}
 
 
 def _opening(results: Results, compared: dict[str, Any] | None) -> dict[str, Any] | None:

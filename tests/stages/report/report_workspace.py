@@ -178,3 +178,20 @@ def written(inputs: dict[str, Path], folder: Path, progress: Any, **settings: An
     result = report.run(report.Config(**settings), inputs, folder, progress)
     assert result.outputs == ("report.html", "summary.json")
     return (folder / "report.html").read_text("utf-8"), json.loads((folder / "summary.json").read_text("utf-8"))
+
+
+def add_stereo_check(inputs: dict[str, Path], compared: int, supervised: bool) -> None:
+    """As evaluate leaves it where there are depth maps: ``compared`` of 18 photos, of which one has no depth."""
+    figures = {"pixels": 2048, "differ": 0.0831, "nearer": 0.0514, "median_difference": 0.0093}
+    images: list[dict[str, Any]] = [{"name": f"IMG_{i:04d}.jpg"} | figures for i in range(1, compared)]
+    images.append({"name": NASTY, "pixels": 0, "differ": None, "nearer": None, "median_difference": None})
+    (inputs["evaluate"] / "stereo_check").mkdir()
+    for image in [one for one in images if one["pixels"]][:2]:
+        image["picture"] = f"stereo_check/{image['name'][:-4]}.png"
+        _picture(3, (64, 48)).save(inputs["evaluate"] / image["picture"])
+    counts = {"photos_compared": compared, "photos_train": 18, "min_difference": 0.03}
+    overall = figures | {"pixels": 2048 * (compared - 1)}
+    worst = [image["name"] for image in images[:2]]
+    write_json(inputs["evaluate"] / "stereo_check.json", counts | overall | {"images": images, "worst": worst})
+    manifest = json.loads((inputs["train"] / "manifest.json").read_text("utf-8"))
+    write_json(inputs["train"] / "manifest.json", manifest | {"config": {"depth": supervised}})

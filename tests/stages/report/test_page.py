@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stages.io.files import SMALL_COPY, write_json, write_tensors
-from tests.stages.report.report_workspace import make_workspace, written
+from tests.stages.report.report_workspace import add_stereo_check, make_workspace, written
 from tests.stages.viewer.browser import WAIT_SECONDS, chromium
 
 
@@ -169,3 +169,27 @@ def test_no_screen_is_too_narrow_and_wide_ones_are_used(tmp_path: Path, progress
         assert page.evaluate(cut_off) == []
         halves = page.evaluate("[...document.querySelectorAll('.half')].map((e) => e.getBoundingClientRect().left)")
         assert len(set(halves)) == (2 if width >= 1280 else 1)
+
+
+@pytest.mark.parametrize("supervised", [False, True])
+def test_depth_beside_stereo_is_shown_where_it_is_known(supervised: bool, tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    without, _ = written(inputs, tmp_path / "without", progress)
+    add_stereo_check(inputs, 5, supervised)
+    html, _ = written(inputs, tmp_path / "with", progress)
+    title = "<h2>Depth beside stereo</h2>"
+    assert title not in without and html.count(title) == 1
+    section = html.partition(title)[2].partition("</section>")[0]
+    for figure in ("At 8.31% of", "nearer at 5.14%", "farther at 3.17%", "is 0.93%", "8,192 random pixels of 5 of 18 "):
+        assert figure in section
+    assert section.count('src="data:image/jpeg;base64,') == 2
+    assert section.count("<tr><td>") == 5 and '<td class="number">0</td><td class="number">–</td>' in section
+    assert ("supervised" in section) == supervised
+
+
+def test_depth_that_was_compared_nowhere_is_not_shown(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    add_stereo_check(inputs, 1, False)
+    file = inputs["evaluate"] / "stereo_check.json"
+    write_json(file, json.loads(file.read_text("utf-8")) | {"pixels": 0, "worst": []})
+    assert "Depth beside stereo" not in written(inputs, tmp_path / "out", progress)[0]
