@@ -29,7 +29,7 @@ MAX_SAME_VIEW_PX = 1.0
 PLANAR_CONFIGS = (4, 5, 6)  # colmap TwoViewGeometry: PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
 PAIR_BASE = 2**31 - 1  # pair_id = PAIR_BASE * first image id + second image id
 NEAR_DUPLICATE = "sfm.unregistered-near-duplicate"
-OVERLAP_HINT = "Take photos with 60–80 % overlap, so that each point is visible in at least three of them."
+OVERLAP_HINT = "Take photos with 60–80% overlap, so that each point is visible in at least three of them."
 
 
 @dataclass(frozen=True)
