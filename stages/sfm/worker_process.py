@@ -78,7 +78,8 @@ def _run_once(job: dict[str, Any], log: Path, photos: int, progress: Progress) -
             progress.update(*_describe(latest, photos))
 
     with live_line(progress, lambda: _describe(latest, photos)):
-        return *run_child(COMMAND, log, job, job["max_seconds"], hear), latest
+        ending = run_child(COMMAND, log, job, job["max_seconds"], hear)
+    return ending.status, ending.late, latest
 
 
 class Ending(NamedTuple):
