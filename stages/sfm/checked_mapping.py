@@ -119,7 +119,7 @@ def run_mapping(strategy: Strategy, database: Path, state: JobState) -> Mapped |
     others = global_mapping.found_models(global_run) if global_run and not failure else []
     if not found and others:
         text = "global mapping is used: incremental mapping found no model"
-        state.send(note=Note("sfm.global-mapping", text))
+        state.send(note=Note("sfm.global-mapping-alone", text))
         found, others = others, []
     mapped = None
     if found:

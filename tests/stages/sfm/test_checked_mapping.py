@@ -204,7 +204,7 @@ def test_global_mapping_stands_in_where_incremental_mapping_fails(
     state: Any = SimpleNamespace(job=job, thinned=False, **kept, **ways)
     mapped = checked_mapping.run_mapping(STRATEGIES[0], made.database, state)
     assert mapped and compare_models(made.model, mapped.checked.model)["agree"] == PHOTOS
-    assert notes == ["sfm.global-mapping"] and mapped.global_mapping is None
+    assert notes == ["sfm.global-mapping-alone"] and mapped.global_mapping is None
 
 
 def test_what_global_mapping_dies_of_is_told(tmp_path: Path) -> None:
