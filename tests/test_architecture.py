@@ -312,6 +312,14 @@ def hand_made_plurals(module: Module) -> Iterator[str]:
             yield ast.unparse(node)
 
 
+def spaced_percentages(module: Module) -> Iterator[str]:
+    """``5 %`` in what is printed: ``{share:.0%}`` writes 5%, and one style is enough."""
+    for node in ast.walk(module.tree):
+        parts = node.values if isinstance(node, ast.JoinedStr) else []
+        if any(isinstance(part, ast.Constant) and str(part.value).startswith(" %") for part in parts[1:]):
+            yield ast.unparse(node)
+
+
 def calls_of_plan(module: Module) -> Iterator[str]:
     """Calls of a stage's plan() beside :func:`stages.contract.plan_stage`."""
     for name in calls(module.tree):
@@ -465,6 +473,10 @@ def test_messages_count_in_one_way():
     assert offenders(hand_made_plurals, [module for module in OURS if module not in NERF]) == []
 
 
+def test_messages_write_percentages_in_one_way():
+    assert offenders(spaced_percentages, OURS) == []
+
+
 MANY = ", ".join("abcdefghi")
 BROKEN: dict[Rule, list[tuple[str, str]]] = {
     imports_against_the_current: [("nerf/a.py", "def f():\n    import stages.io"), ("stages/a.py", "import pipeline")],
@@ -511,6 +523,7 @@ BROKEN: dict[Rule, list[tuple[str, str]]] = {
         ("a.py", "f\"{n} photo{'s' * (n != 1)}\""),
         ("a.py", "f\"{n} strateg{'y' if n == 1 else 'ies'}\""),
     ],
+    spaced_percentages: [("a.py", "f'{share:.0f} % of it'")],
     hidden_zeros: [("a.py", "x / (y + 1e-8)"), ("a.py", "x / (1e-8 + y)")],
 }
 

@@ -89,7 +89,7 @@ class PlainDisplay:
         now = time.monotonic()
         if self._stage and now - self._last >= HEARTBEAT_SECONDS:
             self._last = now
-            share = "" if done is None else f" {100 * done:.0f} %"
+            share = "" if done is None else f" {100 * done:.0f}%"
             self._say(f"{self._stage:<10} …{share} {message}")
 
     def note(self, code: str, text: str) -> None:

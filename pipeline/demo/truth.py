@@ -89,16 +89,16 @@ class Comparison:
         rotation, position = self.rotation_deg, self.position_percent
         said = [
             f"cameras    {len(rotation)}/{self.photos} registered · rotation off by {np.median(rotation):.3f}°, at "
-            f"worst {rotation.max():.3f}° · position by {np.median(position):.3f} %, at worst {position.max():.3f} % "
-            f"of the scene's size · focal length by {self.focal_percent:+.2f} %",
-            f"promise    every camera within {MAX_ROTATION_DEG}° and {MAX_POSITION_PERCENT:g} %: "
+            f"worst {rotation.max():.3f}° · position by {np.median(position):.3f}%, at worst {position.max():.3f}% "
+            f"of the scene's size · focal length by {self.focal_percent:+.2f}%",
+            f"promise    every camera within {MAX_ROTATION_DEG}° and {MAX_POSITION_PERCENT:g}%: "
             + ("kept" if self.holds() else "NOT kept"),
         ]
         if self.mesh is not None:
             accuracy, completeness, chamfer = self.mesh
             said.append(
-                f"mesh       {chamfer:.2f} % of the scene's size from the true surface (two-sided chamfer: mesh to "
-                f"truth {accuracy:.2f} %, what the photos show of the truth to mesh {completeness:.2f} %)"
+                f"mesh       {chamfer:.2f}% of the scene's size from the true surface (two-sided chamfer: mesh to "
+                f"truth {accuracy:.2f}%, what the photos show of the truth to mesh {completeness:.2f}%)"
             )
         return said
 

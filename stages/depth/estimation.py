@@ -93,7 +93,7 @@ def match_pairs(photos: TrainingPhotos, pairs: Pairs, folder: Path, progress: Pr
                 if not waiting[number]:
                     _write_agreed(photos, number, neighbours[number], folder)
                     del waiting[number]
-        progress.update(f"matched {done} of {len(to_do)} pairs of photos", MATCHING * done / len(to_do))
+        progress.update(f"matched {done:,} of {len(to_do):,} pairs of photos", MATCHING * done / len(to_do))
 
 
 def depth_maps(photos: TrainingPhotos, folder: Path) -> ReadMap:
@@ -193,7 +193,7 @@ def _nothing_agrees(pairs: int) -> StageError:
     return StageError(
         "depth.nothing-agrees",
         "no depth was found",
-        f"no two of {pairs} pairs of photos agree on any point",
+        f"no two of {pairs:,} pairs of photos agree on any point",
         "Check the cameras, or add photos: each point needs three photos and some texture.",
     )
 

@@ -282,7 +282,7 @@ def _what_is_missing(image: Any, error: OSError) -> str:
     except OSError:  # the decoder refused before there were any pixels
         return f"{word}: {error}"
     missing = 1 - (np.flatnonzero(rows)[-1] + 1) / image.height if rows.any() else 1.0
-    return f"{word}: {100 * missing:.0f} % of the image is missing" if missing >= 0.005 else f"{word}: {error}"
+    return f"{word}: {100 * missing:.0f}% of the image is missing" if missing >= 0.005 else f"{word}: {error}"
 
 
 def _to_eight_bit(image: Image.Image) -> Image.Image:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from stages.contract import StageError
+from stages.io.amounts import counted
 
 # Everything else is tried: what counts as a photo is decided by decoding, not by the name.
 # fmt: off
@@ -136,7 +137,7 @@ def _no_photos(root: Path, found: list[Path], videos: list[Path]) -> StageError:
     return StageError(
         "ingest.no-photos",
         f"no photos in {root}",
-        f"none of its {len(found)} files is an image ({suffixes})",
+        f"it has {counted(len(found), 'file')} ({suffixes}), but no image",
         FOLDER_HINT,
     )
 

@@ -137,7 +137,7 @@ def excluded_by_values(files: Sequence[str]) -> list[Note]:
     if not files:
         return []
     count, named = _files_are(files), _first_names(files)
-    words = f"{count} excluded as depth maps: grey values of 16 bits or floats among colour photos: {named}"
+    words = f"{count} excluded, with grey values of 16 bits or floats as in depth maps: {named}"
     return [Note("ingest.depth-maps", words)]
 
 
@@ -146,7 +146,7 @@ def excluded_masks(files: Sequence[str]) -> list[Note]:
     if not files:
         return []
     count, named = _files_are(files), _first_names(files)
-    words = f"{count} excluded as masks, because they are pure black and white: {named}. To use them, name each"
+    words = f"{count} excluded, in pure black and white as masks are: {named}. To use a mask, name it"
     return [Note("ingest.black-and-white", f"{words} masks/NAME.png after its photo; black is ignored")]
 
 
@@ -265,7 +265,7 @@ def too_few(source: Source, names: Sequence[str], rejected: Sequence[Rejection])
         return StageError(
             "ingest.one-usable-photo",
             f"{only} is the only usable photo",
-            f"{len(rejected)} other files were rejected",
+            f"{counted(len(rejected), 'other file was', 'other files were')} rejected",
             HINT,
         )
     return StageError(
@@ -329,10 +329,10 @@ def _cameras(source: Source, photos: Sequence[Photo]) -> str:
     cameras = "one camera" if groups == 1 else f"{groups} cameras"
     known = [photo.focal_px for photo in photos if photo.focal_px is not None]
     if not known:
-        return f"{cameras}, no EXIF focal"
+        return f"{cameras}, no EXIF focal length"
     if len(known) < len(photos):
-        return f"{cameras}, EXIF focal for {len(known)}"
-    return f"{cameras}, EXIF focal" + (f" {known[0]:.0f} px" if len(set(known)) == 1 else "")
+        return f"{cameras}, EXIF focal length for {len(known)}"
+    return f"{cameras}, EXIF focal length" + (f" {known[0]:.0f} px" if len(set(known)) == 1 else "")
 
 
 def facts(source: Source, photos: Sequence[Photo], rejected: Sequence[Rejection]) -> dict[str, object]:

@@ -96,7 +96,7 @@ def choose_iso_level(grid: DensityGrid, field: DensityField, rays: Rays) -> IsoL
         best = min(errors, key=errors.__getitem__)
     first, last = (f"{level:.2g}" if level < 10 else f"{level:.0f}" for level in (candidates[0], candidates[-1]))
     reason = (
-        f"of densities from {first} to {last}, its surface is closest to where the transmittance of {len(depth)} "
+        f"of densities from {first} to {last}, its surface is closest to where the transmittance of {len(depth):,} "
         f"rays of the photos falls to one half: {errors[best]:.2f} voxels away on average"
     )
     return IsoLevel(candidates[best], reason, errors[best], errors[best] < CLIP_VOXELS / 2)

@@ -45,7 +45,7 @@ class Config(StageConfig):
     seconds: Auto[float] = Field(
         default=None,
         gt=0,
-        description="Time limit in seconds (default: 30 % of the training time).",
+        description="Time limit in seconds (default: 30% of the training time).",
     )
     depth: bool = Field(default=True, description="Also write depth.mp4.")
     match_exposure: Auto[str] = Field(

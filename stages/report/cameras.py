@@ -83,7 +83,7 @@ def _doubts_of_check(registration: Mapping[str, Any]) -> list[str]:
         noise = f"{check['error_px'] / check['noise_px']:.0f} times their noise"
         found.append(f"verified matches are {check['error_px']:.1f} px off, {noise}")
     if len(breaks := _sequence_breaks(registration)) > MAX_DOUBTFUL * photos:
-        found.append(f"the matches of {len(breaks)} pairs of consecutive photos contradict their poses")
+        found.append(f"the matches of {counted(len(breaks), 'pair')} of consecutive photos contradict their poses")
     links = _weak_links(registration)
     weak = {file for link in links for file in link["photos"]}
     # A lone photo at the edge of many does no harm; of a group the place and size beside the rest are not sure.

@@ -136,4 +136,4 @@ def with_error(reference: Reference) -> str:
 
 def in_words(metres: float, relative_error: float) -> str:
     """A unit's length with two standard errors."""
-    return f"{length_in_words(metres)} ± {100 * 2 * relative_error:.2g} %"
+    return f"{length_in_words(metres)} ± {100 * 2 * relative_error:.2g}%"

@@ -187,7 +187,7 @@ def _line(registration: dict[str, Any]) -> str:
         line += f", {counted(same, 'near-duplicate')} left out"
     line += "" if error is None else f", {error:.2f} px"
     line += f" · {registration['camera_model']}"
-    return line + (f" · {points:,} points".replace(",", " ") if points else "")
+    return line + (f" · {points:,} points" if points else "")
 
 
 STAGE = Stage(

@@ -84,7 +84,7 @@ class CheckedModel(NamedTuple):
 
 class Mapped(NamedTuple):
     """All sub-models, best first; the best one as checked, which is also the first of these; how global mapping
-    compares, None where it was not begun."""
+    compares, None where it was not begun or gave the only model."""
 
     models: Sequence[Any]
     checked: CheckedModel
@@ -117,14 +117,19 @@ def run_mapping(strategy: Strategy, database: Path, state: JobState) -> Mapped |
         if found and trusted:
             found = _most_steps(found, matches, mapping, hold_focal, state, trusted)
     failure = _not_compared(global_run, state) if global_run else None
+    others = global_mapping.found_models(global_run) if global_run and not failure else []
+    if not found and others:
+        text = "global mapping is used: incremental mapping found no model"
+        state.send(note=Note("sfm.global-mapping-alone", text))
+        found, others = others, []
     mapped = None
     if found:
         if trusted:
             copy_consistent_matches(found[0], state.database, database, trusted)
-        other = global_mapping.found_models(global_run)[0] if global_run and not failure else None
+        other = others[0] if others else None
         checked = _checked(found[0], other, MappingInput(database, matches, options, trusted), state)
         if other is None:
-            compared = {"failed": failure} if global_run else None
+            compared = {"failed": failure} if failure else None
         else:
             compared = _comparison(checked, found[0], other, database, state)
         mapped = Mapped([checked.model, *found[1:]], checked, compared)

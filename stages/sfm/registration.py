@@ -29,7 +29,7 @@ MAX_SAME_VIEW_PX = 1.0
 PLANAR_CONFIGS = (4, 5, 6)  # colmap TwoViewGeometry: PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
 PAIR_BASE = 2**31 - 1  # pair_id = PAIR_BASE * first image id + second image id
 NEAR_DUPLICATE = "sfm.unregistered-near-duplicate"
-OVERLAP_HINT = "Take photos with 60–80 % overlap, so that each point is visible in at least three of them."
+OVERLAP_HINT = "Take photos with 60–80% overlap, so that each point is visible in at least three of them."
 
 
 @dataclass(frozen=True)
@@ -256,20 +256,20 @@ def why_no_model(photos: Sequence[Photo], matches: Matches, registered: int, poi
             "Take sharper, better lit photos, or put something with texture into the scene.",
         )
     if not verified:
-        return StageError("sfm.no-overlap", what, f"none of {pairs} pairs of photos overlaps", OVERLAP_HINT)
+        return StageError("sfm.no-overlap", what, f"none of {pairs:,} pairs of photos overlaps", OVERLAP_HINT)
     if np.median(matches.shift_px) < MAX_SAME_VIEW_PX:
         return StageError(
             "sfm.same-view",
             what,
-            f"all photos show the same view ({verified} of {pairs} pairs differ by less than a pixel)",
+            f"all photos show the same view ({verified:,} of {pairs:,} pairs differ by less than a pixel)",
             f"Move the camera between photos. {STILL_BACKGROUND_HINT}",
         )
     if error := _no_depth(what, photos, matches):
         return error
-    why = f"{verified} of {pairs} pairs of photos overlap, but none of them shows the depth of the scene"
+    why = f"{verified:,} of {pairs:,} pairs of photos overlap, but none of them shows the depth of the scene"
     if registered:
         found = f"only {registered} photos and {points} points were reconstructed"
-        why = f"{found}; {verified} of {pairs} pairs overlap"
+        why = f"{found}; {verified:,} of {pairs:,} pairs overlap"
     return StageError("sfm.no-model", what, why, OVERLAP_HINT)
 
 
@@ -281,14 +281,14 @@ def _no_depth(what: str, photos: Sequence[Photo], matches: Matches) -> StageErro
         return StageError(
             "sfm.pure-rotation",
             what,
-            f"pure rotation: {rotations} of {count} matching pairs differ by a rotation alone",
+            f"pure rotation: {rotations:,} of {count:,} matching pairs differ by a rotation alone",
             "Move the camera sideways between photos, by a tenth of the distance to the scene. Do not only turn it.",
         )
     if forward > count / 2:
         return StageError(
             "sfm.forward-motion",
             what,
-            f"forward motion: in {forward} of {count} matching pairs the camera moves towards something in view, "
+            f"forward motion: in {forward:,} of {count:,} matching pairs the camera moves towards something in view, "
             "which leaves too little parallax",
             "Step sideways between photos as well, by a tenth of the distance to the scene, or turn the camera aside.",
         )
@@ -296,7 +296,7 @@ def _no_depth(what: str, photos: Sequence[Photo], matches: Matches) -> StageErro
         return StageError(
             "sfm.planar-scene",
             what,
-            f"planar scene: one plane explains {planar} of {count} matching pairs",
+            f"planar scene: one plane explains {planar:,} of {count:,} matching pairs",
             "Include something that stands out from the surface, and photograph it from the side as well.",
         )
     return None

@@ -271,6 +271,8 @@ def reason_against(strategy: Strategy, now: Situation) -> str | None:
         return "no fisheye has focal lengths as long as EXIF tells"
     worth = MIN_MISSING_TO_START_OVER * now.images
     if strategy.matches == "missing":
+        if now.missing == now.images:
+            return "there is no model that photos could be added to"
         too_many = now.missing >= max(2, worth)
         return f"{now.missing} of {now.images} photos are too many to add to a model" if too_many else None
     if strategy.matches not in ("consecutive", "same"):  # these cost as much as the first strategy, or nearly

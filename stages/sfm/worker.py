@@ -95,8 +95,7 @@ def reconstruct(job: Job, send: Send) -> dict[str, Any]:
     checked, left_out = _last_check(model, database, state)
     checked["doubtful"] = sorted({*checked["doubtful"], *({*best.excluded, *left_out} - {*_files(model)})})
     upright = turned_upright(model, state.turns) if state.turns else model
-    if state.thinned or state.turns:  # mapping leaves colours out, or takes them from the wrong places
-        upright.extract_colors_for_all_images(state.images)
+    upright.extract_colors_for_all_images(state.images)  # mapping leaves colours out
     left_out = best.excluded | finished.left_out | left_out
     registered = [model.image(i) for i in sorted(model.reg_image_ids())]
     write_native(Path(job.folder, "sparse"), upright)

@@ -162,9 +162,9 @@ def _describe(latest: Mapping[str, Any], photos: int) -> tuple[str, float | None
         return "final bundle adjustment", REFINING
     features, pairs = count_done(Path(latest["database"]))  # the first of mapping's steps registers two photos
     done, total, words = {
-        "features": (features, photos, "features of {} of {} photos"),
-        "matching": (pairs, latest["pairs"], "matched {} of {} pairs of photos"),
-        "mapping": (latest["done"] and min(latest["done"] + 1, photos), photos, "registered {} of {} photos"),
+        "features": (features, photos, "features of {:,} of {:,} photos"),
+        "matching": (pairs, latest["pairs"], "matched {:,} of {:,} pairs of photos"),
+        "mapping": (latest["done"] and min(latest["done"] + 1, photos), photos, "registered {:,} of {:,} photos"),
     }[phase]
     begin, length = PHASES[phase]
     share = begin + length * done / max(1, total)

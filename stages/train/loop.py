@@ -36,7 +36,7 @@ from nerf.training.step_schedule import (
 )
 from nerf.training.trainer import RAY_GEOMETRY, FieldTrainer, NonFinite
 from stages.contract import Progress, StageError
-from stages.io.amounts import counted, short_count
+from stages.io.amounts import counted, duration, short_count
 from stages.io.files import read_json, write_durably
 from stages.io.stopwatch import live_line
 from stages.train.checkpoints import (
@@ -480,12 +480,12 @@ def speed_message(state: RunState, speed: TrainingSpeed, left: float) -> str:
     known = [point["probe_psnr"] for point in state.curve if point["probe_psnr"] is not None]
     test = f" · {known[-1]:.1f} dB on test pixels" if known else ""
     rays = f"{short_count(speed.rays_per_step / speed.seconds_per_step)} rays/s"
-    return f"step {state.step:,} · {rays} · train {speed.psnr:.1f} dB{test} · {left:.0f} s left"
+    return f"step {state.step:,} · {rays} · train {speed.psnr:.1f} dB{test} · {duration(left)} left"
 
 
 def resumed_message(step: int, total_steps: int, left: float | None) -> str:
     """After a kill; ``left``: the seconds left of a run in seconds."""
-    rest = f" of {total_steps:,}" if left is None else f", with {max(0.0, left):.0f} s of training left"
+    rest = f" of {total_steps:,}" if left is None else f", with {duration(max(0.0, left))} of training left"
     return f"resuming from step {step:,}{rest}"
 
 
@@ -497,7 +497,7 @@ def lost_time_message(seconds: float) -> str | None:
     """What a kill cost; None below a second."""
     if seconds < 1:
         return None
-    return f"{seconds:.0f} s of training after the last checkpoint are lost and count as spent"
+    return f"{duration(seconds)} of training after the last checkpoint are lost and count as spent"
 
 
 def target_already_reached_message(target_psnr: float) -> str:

@@ -73,11 +73,12 @@ def planned(config: Config, inputs: Inputs, progress: Progress) -> Config:
 def reason(config: Config, rays: float) -> str:
     """What sizes that were left open are chosen for."""
     if config.steps is None:
-        budget = f"{config.seconds:g} s on this machine render"
+        assert config.seconds is not None, "one of the two is given"
+        budget = f"{duration(config.seconds)} on this machine render"
     else:
         budget = counted(config.steps, "step renders", "steps render")
     work = field_of(config).work(config, rays)
-    return f"{budget} about {short_count(rays)} rays{work}; sizes that no option sets follow from that"
+    return f"{budget} about {short_count(rays)} rays{work}; the sizes that you leave open follow from that"
 
 
 def _used_shares(ingest: Path, scene: "Scene") -> dict[str, float]:

@@ -26,7 +26,7 @@ from stages.effects.image_effects import image_effects, learnt_effects
 from stages.hardware.device import compute_device
 from stages.hardware.memory import check_memory
 from stages.hardware.ranks import check_ranks, leading, rank_count, tasks_of_first_rank
-from stages.io.amounts import counted, short_count
+from stages.io.amounts import counted, duration, short_count
 from stages.io.field_files import save_field
 from stages.io.files import read_scene
 from stages.train.checkpoints import checkpoint_files
@@ -299,12 +299,12 @@ def _rank_facts(run: TrainingRun) -> dict[str, object]:
 
 
 def _summary(training: Training) -> str:
-    """180 s · 5.4 k steps · 24 k rays/s · 28.9 dB on test pixels, over time ▁▃▅▆▇█ · as long again (--more 3m) is
+    """3 min · 5.4 k steps · 24 k rays/s · 28.9 dB on test pixels, over time ▁▃▅▆▇█ · as long again (--more 3m) is
     predicted to gain +0.6 ± 0.4 dB."""
     config, state = training.config, training.run.state
     probe = state.curve[-1]["probe_psnr"]
-    before = "" if config.after is None else f", {state.seconds_before:.0f} s of them in the earlier training"
-    parts: list[str | None] = [f"{state.seconds:.0f} s{before}"]
+    before = "" if config.after is None else f", {duration(state.seconds_before)} of them in the earlier training"
+    parts: list[str | None] = [f"{duration(state.seconds)}{before}"]
     parts += [f"{short_count(state.step)} steps", f"{short_count(state.rays / state.seconds)} rays/s"]
     spark = sparkline(state.curve)
     rising = f", over time {spark}" if spark else ""

@@ -28,5 +28,5 @@ def test_a_video_becomes_a_scene(
     assert held == sorted(set(held)) and 10 <= len(held) <= len(files)  # one frame of each photo that has moved enough
     views = read_json(tmp_path / "w.nerf/output/scene.json")["views"]
     assert 10 <= len(views) <= len(held)
-    line = f"{len(held)} frames 240×180, one camera, no EXIF focal, {photos[-1]['time_s']:.1f} s of video"
+    line = f"{len(held)} frames 240×180, one camera, no EXIF focal length, {photos[-1]['time_s']:.1f} s of video"
     assert line in capsys.readouterr().out

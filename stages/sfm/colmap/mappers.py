@@ -55,9 +55,9 @@ def incremental_options(
     are in the database, whatever becomes of the others.
     """
     options = pipeline_options(seed + mapping.seed_offset)
-    # Otherwise each photo is decoded as it is registered, in every mapping. Of thinned matches all points are coloured
-    # in the end (stages/sfm/worker.py).
-    options.extract_colors = not thinned
+    # Otherwise each photo is decoded as it is registered, in every mapping, and points that come later have no colour.
+    # All are coloured in the end (stages/sfm/worker.py).
+    options.extract_colors = False
     options.constant_cameras = options.mapper.constant_cameras = set(held_cameras)
     if thinned:
         options.ba_global_frames_ratio = options.ba_global_points_ratio = BA_GLOBAL_RATIO

@@ -105,10 +105,10 @@ def _describe(latest: Mapping[str, Any], photos: int, database: Path) -> tuple[s
     """The live line and the finished share of the whole."""
     features, pairs = count_done(database)
     if latest["phase"] == FEATURES:
-        return f"features of {features} of {photos} photos, to check the imported poses", 0.6 * features / photos
+        return f"features of {features:,} of {photos:,} photos, to check the imported poses", 0.6 * features / photos
     if latest["phase"] == MATCHING:
         of = max(1, latest["pairs"])
-        return f"matched {pairs} of {of} pairs of photos, to check the imported poses", 0.6 + 0.2 * pairs / of
+        return f"matched {pairs:,} of {of:,} pairs of photos, to check the imported poses", 0.6 + 0.2 * pairs / of
     return latest["phase"], 0.8
 
 

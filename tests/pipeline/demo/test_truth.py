@@ -45,7 +45,7 @@ def test_the_truth_has_no_error(tmp_path: Path):
     assert found.mesh is None
     assert found.holds()
     assert found.lines()[0].startswith("cameras    12/12 registered · rotation off by 0.000°, at worst 0.000° · ")
-    assert found.lines()[1] == "promise    every camera within 0.5° and 1 %: kept"
+    assert found.lines()[1] == "promise    every camera within 0.5° and 1%: kept"
 
 
 def test_a_turned_camera_and_a_wrong_focal_length_are_measured(tmp_path: Path):

@@ -190,7 +190,7 @@ def test_a_truncated_jpeg_says_how_much_is_missing(tmp_path: Path) -> None:
     path.write_bytes(data.getvalue()[: int(0.6 * data.tell())])
     refused = refusal(path)
     assert refused.code == "ingest.damaged-file"
-    (missing,) = re.findall(r"(\d+) %", refused.reason)
+    (missing,) = re.findall(r"(\d+)%", refused.reason)
     assert 36 < int(missing) < 46
 
 

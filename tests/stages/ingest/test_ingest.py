@@ -54,7 +54,7 @@ def test_plain_photos_are_copied_byte_for_byte(tmp_path: Path, progress: Any) ->
     assert [photo.file for photo in photos] == ["images/a.png", "images/b.JPG", "images/sub/c.jpg"]
     for photo in photos:
         assert (tmp_path / "out" / photo.file).read_bytes() == (tmp_path / "in" / photo.name).read_bytes()
-    assert result.line == "3 photos 32×24, 2 cameras, no EXIF focal"
+    assert result.line == "3 photos 32×24, 2 cameras, no EXIF focal length"
     assert result.outputs == ("images", "photos.json")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["images", "photos.json"]
     assert progress.updates[-2:] == [
@@ -92,7 +92,7 @@ def test_refused_files_are_named_and_do_not_stop_the_rest(tmp_path: Path, progre
     (folder / "notes.jpg").write_text("not a photo at all\n")
     (folder / "z copy of a.jpg").write_bytes((folder / "a.jpg").read_bytes())
     result = ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
-    assert result.line == "2 photos 32×24, one camera, no EXIF focal, 3 rejected"
+    assert result.line == "2 photos 32×24, one camera, no EXIF focal length, 3 rejected"
     refused = read_json(tmp_path / "out/photos.json")["rejected"]
     assert [rejection["name"] for rejection in refused] == ["cut.jpg", "notes.jpg", "z copy of a.jpg"]
     codes = [rejection["code"] for rejection in refused]
@@ -127,7 +127,7 @@ def test_too_few_photos_in_words_that_fit(tmp_path: Path, progress: Any) -> None
     put(tmp_path / "rest", "a.jpg")
     (tmp_path / "rest/b.jpg").write_text("text")
     error = failure(tmp_path / "rest", tmp_path / "out4", progress)
-    assert error.code == "ingest.one-usable-photo" and "a.jpg" in error.what and "1 other" in error.why
+    assert error.code == "ingest.one-usable-photo" and "a.jpg" in error.what and "1 other file " in error.why
 
 
 def test_cameras_are_told_apart(tmp_path: Path, progress: Any) -> None:
@@ -141,7 +141,7 @@ def test_cameras_are_told_apart(tmp_path: Path, progress: Any) -> None:
     photos = read_photos(tmp_path / "out")
     assert [photo.camera_group for photo in photos] == [0, 0, 1, 2]
     assert photos[3].focal_px == pytest.approx(50 / 43.27 * 40)
-    assert result.line == "4 photos in 2 sizes, 3 cameras, EXIF focal for 1"
+    assert result.line == "4 photos in 2 sizes, 3 cameras, EXIF focal length for 1"
     assert result.facts["sizes"] == [[32, 24], [40, 24]]
 
 
@@ -230,7 +230,7 @@ def test_of_nearly_the_same_pictures_the_sharpest_goes_on(tmp_path: Path, progre
     photos = read_photos(tmp_path / "out")
     assert [photo.near_duplicate_of for photo in photos] == ["1.png", None, None, "2.png", None]
     assert all((tmp_path / "out" / photo.file).is_file() for photo in photos)
-    assert result.line == "5 photos 320×240, one camera, no EXIF focal"
+    assert result.line == "5 photos 320×240, one camera, no EXIF focal length"
     assert progress.codes == ["ingest.near-duplicates"]
     assert progress.names("ingest.near-duplicates", "2 photos", "0.png (as 1.png), 3.png (as 2.png)")
 
@@ -310,7 +310,10 @@ def test_a_video_becomes_photos_with_times(tmp_path: Path, progress: Any) -> Non
     result = ingest.run(Config(photos=tmp_path / "my clip.mp4", frames=10), {}, tmp_path / "out", progress)
     photos = read_photos(tmp_path / "out")
     assert 5 < len(photos) <= 10
-    assert result.line == f"{len(photos)} frames 160×120, one camera, no EXIF focal, {photos[-1].time_s:.1f} s of video"
+    assert (
+        result.line
+        == f"{len(photos)} frames 160×120, one camera, no EXIF focal length, {photos[-1].time_s:.1f} s of video"
+    )
     for photo in photos:
         assert photo.time_s is not None and photo.name == f"frame_{round(10 * photo.time_s):06d}.jpg"
         assert photo.file == f"images/{photo.name}" and photo.camera_group == 0
@@ -405,8 +408,8 @@ def test_a_full_disk_is_said_in_words(tmp_path: Path, progress: Any, monkeypatch
 @pytest.mark.parametrize(
     ("scene", "line"),
     [
-        ("sceaux_castle", "11 photos 1416×1064, one camera, EXIF focal 1433 px"),
-        ("room_no_overlap", "8 photos in 2 sizes, 2 cameras, no EXIF focal"),
+        ("sceaux_castle", "11 photos 1416×1064, one camera, EXIF focal length 1433 px"),
+        ("room_no_overlap", "8 photos in 2 sizes, 2 cameras, no EXIF focal length"),
         ("lego_400", "125 photos 400×400 with alpha, poses imported"),
     ],
 )

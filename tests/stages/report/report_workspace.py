@@ -45,7 +45,7 @@ LINES = {
     "ingest": "24 photos 96×72, one camera",
     "sfm": "23/24 registered, 0.61 px",
     "normalise": "around an object, bounded",
-    "scale": "1 unit = 50 cm ± 0.4 % by 2 markers",
+    "scale": "1 unit = 50 cm ± 0.4% by 2 markers",
     "train": "180 s · 24 k rays/s · 21.4 dB on test pixels",
     "evaluate": "21.4 ± 0.4 dB, SSIM 0.61",
     "render": "orbit, 120 frames",

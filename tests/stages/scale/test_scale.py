@@ -218,7 +218,7 @@ def test_inexact_gps_gives_no_metres(tmp_path: Path, progress: Any) -> None:
         told = measured(tmp_path / str(share), progress, photos_of((TAG,)), georeference=georeference)
         assert told["metres_per_unit"] == metres
     assert told["source"] is None and told["references"][0]["problem"] == "gps-inexact"
-    assert progress.codes == ["scale.gps-inexact"] and progress.names("scale.gps-inexact", "3 m ± 25 %", "25%")
+    assert progress.codes == ["scale.gps-inexact"] and progress.names("scale.gps-inexact", "3 m ± 25%", "25%")
 
 
 def test_gps_that_contradicts_a_marker_is_named(tmp_path: Path, progress: Any) -> None:

@@ -191,6 +191,22 @@ def test_global_mapping_runs_beside_and_agrees(made: Made, tmp_path: Path) -> No
     assert compared["agree"] == PHOTOS and compared["centre"] < 0.02 and compared["different"] == []
 
 
+def test_global_mapping_stands_in_where_incremental_mapping_fails(
+    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checked_mapping, "_map_incrementally", lambda *_: [])
+    monkeypatch.setattr(checked_mapping, "capture_sequence", lambda *_: [])
+    notes, job = list[str](), SimpleNamespace(seed=0, camera_params=None, folder=str(tmp_path))
+    kept: Any = {"log": SimpleNamespace(folder=tmp_path / "log"), "images": tmp_path, "photos": [made] * PHOTOS}
+    ways = dict.fromkeys(("begin", "end"), lambda *_, **__: None) | {"send": lambda note: notes.append(note.code)}
+    ways |= {"sibling": lambda name: tmp_path / f"{name}.db", "left_at_most": lambda: 1000.0}
+    kept["photos"] = [SimpleNamespace(camera_group=0)] * PHOTOS
+    state: Any = SimpleNamespace(job=job, thinned=False, **kept, **ways)
+    mapped = checked_mapping.run_mapping(STRATEGIES[0], made.database, state)
+    assert mapped and compare_models(made.model, mapped.checked.model)["agree"] == PHOTOS
+    assert notes == ["sfm.global-mapping-alone"] and mapped.global_mapping is None
+
+
 def test_what_global_mapping_dies_of_is_told(tmp_path: Path) -> None:
     damaged = tmp_path / "damaged.db"
     damaged.write_bytes(b"no database" * 100)

@@ -8,6 +8,7 @@ import pytest
 from stages.contract import Note
 from stages.ingest.masks import STILL_BACKGROUND_HINT
 from stages.io.photos import Photo
+from stages.sfm import _line
 from stages.sfm.registration import (
     Matches,
     count_done,
@@ -200,3 +201,8 @@ def test_a_database_cut_short_is_not_sound(database: Path, keep: int) -> None:
     assert len(content) > keep
     database.write_bytes(content[:keep])
     assert not is_sound(database, NAMES)
+
+
+def test_the_line_groups_points_as_other_numbers() -> None:
+    facts = {"source": "sfm", "check": None, "reprojection_px": 0.5, "points": 87446, "registered": 4, "photos": 4}
+    assert "87,446" in _line(facts | {"near_duplicates": 0, "camera_model": "PINHOLE"})

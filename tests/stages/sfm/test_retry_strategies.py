@@ -162,6 +162,7 @@ APART = "form models of their own"
         ("missing photos", {"missing": 29, "images": 300}, None),
         ("missing photos", {"missing": 30, "images": 300}, "30 of 300 photos are too many"),
         ("missing photos", {"missing": 1, "images": 8}, None),
+        ("missing photos", {"missing": 8, "images": 8}, "no model"),
         ("missing photos", {"missing": 1, "sequence_broken": True}, "repeated structure"),
         ("other seed", {"missing": 1, "images": 8}, None),
         ("relaxed ratio test", {"missing": 1, "images": 8}, "starting over is not worth it for 1 of 8"),

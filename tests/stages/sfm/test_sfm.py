@@ -452,6 +452,11 @@ def test_photos_that_look_alike_are_enough(inputs: dict[str, Path], tmp_path: Pa
     assert graph["order"]
 
 
+def test_all_points_have_colours(reconstructed: Path) -> None:
+    rgb = read_model(reconstructed / "sparse").rgb
+    assert len(rgb) > 100 and rgb.any(axis=1).mean() > 0.99
+
+
 def test_every_photo_is_checked_and_global_mapping_agrees(reconstructed: Path) -> None:
     account = read_json(reconstructed / "registration.json")
     check, other = account["check"], account["global_mapping"]

@@ -115,3 +115,15 @@ def test_only_the_strategy_at_work_is_abandoned(
     assert sorted(abandoned) == (["fisheye"] if late else ["fisheye", "missing photos"])
     assert progress.codes == ([] if late else ["sfm.strategy-crashed"] * 2)
     assert limits == sorted(limits, reverse=True) and limits[-1] < Config().max_seconds
+
+
+def test_the_live_line_groups_large_numbers(tmp_path: Path) -> None:
+    latest = {
+        "phase": "matching",
+        "pairs": 6600,
+        "done": 0,
+        "strategy": "default",
+        "database": str(tmp_path / "none.db"),
+    }
+    message, _ = worker_process._describe(latest, 400)
+    assert "6,600" in message

@@ -162,6 +162,11 @@ def test_the_live_line_tells_step_speed_quality_and_time_left(tmp_path: Path, pr
     assert done == pytest.approx(1)
 
 
+def test_times_of_minutes_are_not_told_in_seconds() -> None:
+    assert "4 min 26 s" in loop.resumed_message(5, 40, 266.4)
+    assert "2 min" in str(loop.lost_time_message(120.0)) and loop.lost_time_message(0.5) is None
+
+
 def test_every_checkpoint_loads(tmp_path: Path, progress) -> None:
     run_in(tmp_path, progress).train()
     found = latest_checkpoint(tmp_path / "checkpoints", no_note)

@@ -14,7 +14,7 @@ from stages.sfm.retry_strategies import MappingOptions
 from tests.stages.sfm.colmap.made_models import FOCAL_PX, PHOTOS, enter_focal_length, make
 
 
-def test_points_of_thinned_matches_are_coloured_in_the_end(tmp_path: Path) -> None:
+def test_colours_in_the_end_are_those_of_mapping(tmp_path: Path) -> None:
     made, random = make(tmp_path), np.random.default_rng(0)
     camera = made.model.camera(1)
     for image in made.model.images.values():
@@ -22,9 +22,8 @@ def test_points_of_thinned_matches_are_coloured_in_the_end(tmp_path: Path) -> No
         spots.resize((camera.width, camera.height)).save(tmp_path / image.name)
 
     def mapped(coloured: bool) -> pycolmap.Reconstruction:
-        options = incremental_options(0, MappingOptions(), camera_is_known=False, thinned=not coloured)
-        options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.3  # what else thinned matches change
-        options.ba_global_max_refinements = 2
+        options = incremental_options(0, MappingOptions(), camera_is_known=False, thinned=False)
+        options.extract_colors |= coloured
         return map_incrementally(made.database, tmp_path, tmp_path / "models", options)[0]
 
     def points(model: pycolmap.Reconstruction) -> bytes:
