@@ -193,7 +193,7 @@ def _line(registration: dict[str, Any]) -> str:
 STAGE = Stage(
     name="sfm",
     inputs=("ingest",),
-    version=36,
+    version=37,
     exit_code=11,
     resumes=True,
     published=("sparse", "registration.json", "photo_groups"),
