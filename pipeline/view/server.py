@@ -69,6 +69,7 @@ class ViewServer:
         self.url = f"http://{ADDRESS}:{self.port}/{self.token}/"
         self.state = WorkspaceState(root)
         self.asked, self.served_last = -math.inf, math.inf  # when a page last asked; when one got the last field
+        self.has_shown = threading.Event()  # a page has got a field
         self.server = uvicorn.Server(
             uvicorn.Config(
                 self.app(),
@@ -83,10 +84,16 @@ class ViewServer:
     def run(self) -> None:
         """Until Ctrl-C, which arrives as KeyboardInterrupt, or :meth:`stop`."""
         # Before the niceness, which is a thread's own on Linux: on cores that train, loading torch would take a minute.
-        threading.Thread(target=self.state.prepare, daemon=True).start()
+        threading.Thread(target=self._prepare, daemon=True).start()
         if hasattr(os, "nice"):
             os.nice(NICENESS)
         self.server.run(sockets=[self.listener])
+
+    def _prepare(self) -> None:
+        """For the end of the training. Of one that runs already a page gets its first field first, on these cores."""
+        if self.state.training().phase == "training":
+            self.has_shown.wait()
+        self.state.prepare()
 
     def stop(self) -> None:
         """From another thread: end soon."""
@@ -151,6 +158,8 @@ class ViewServer:
     def _field(self, request: Request) -> Response:
         name = request.path_params["name"]
         content = self.state.field(name)
+        if content is not None:
+            self.has_shown.set()
         if content is not None and name == FINISHED:
             self.served_last = time.monotonic()
         return _packed(content)
