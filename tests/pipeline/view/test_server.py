@@ -224,17 +224,21 @@ def test_a_running_training_is_shown_without_loading_torch(running: RunningTrain
 def test_a_page_gets_its_first_field_before_torch_is_loaded(running: RunningTraining) -> None:
     server, loaded = ViewServer(running.root), threading.Event()
     server.state.prepare = loaded.set
-    threading.Thread(target=server.run, daemon=True).start()
-    page = urllib.request.urlopen(server.url + "state")
-    assert json.load(page)["phase"] == "training" and not loaded.wait(1.0)
-    ends = time.monotonic() + WAIT_SECONDS
+    serving = threading.Thread(target=server.run)
+    serving.start()
+
+    def asked(at: str) -> bytes:
+        with urllib.request.urlopen(server.url + at, timeout=60) as answer:
+            return answer.read()
+
+    asked("state")
+    before, ends = loaded.wait(1.0), time.monotonic() + WAIT_SECONDS
     while not loaded.is_set() and time.monotonic() < ends:
-        with urllib.request.urlopen(server.url + "state") as answer:
-            name = json.load(answer)["field"]
-        urllib.request.urlopen(server.url + f"field/{name}").close()
+        asked(f"field/{json.loads(asked('state'))['field']}")
         loaded.wait(0.1)
-    assert loaded.is_set()
     server.stop()
+    serving.join()
+    assert not before and loaded.is_set()
 
 
 def test_tokens_cannot_be_guessed(tmp_path: Path) -> None:
