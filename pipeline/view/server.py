@@ -42,6 +42,7 @@ HEADERS = {
 }
 NICENESS = 10  # the training goes first
 LINGER_SECONDS = 10.0  # at most, after the run during which it serves, for pages to get the last field
+DRAW_SECONDS = 15.0  # that a page may take to draw its first field on cores that train
 OPEN_SECONDS = 4.0  # a page that has not asked for so long is closed: longer than SLOW_POLL_MS in live.js
 
 
@@ -90,9 +91,10 @@ class ViewServer:
         self.server.run(sockets=[self.listener])
 
     def _prepare(self) -> None:
-        """For the end of the training. Of one that runs already a page gets its first field first, on these cores."""
+        """For the end of the training. Of one that runs already a page first gets and draws a field, on these cores."""
         if self.state.training().phase == "training":
             self.has_shown.wait()
+            time.sleep(DRAW_SECONDS)
         self.state.prepare()
 
     def stop(self) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -54,9 +54,7 @@ from stages.train.validation_images import (
     held_out_evaluation,
     with_validation_split,
 )
-
-if TYPE_CHECKING:
-    from stages.viewer.live import LiveContents
+from stages.viewer.live import LiveContents
 
 LACKS_MEMORY = (
     "the GPU's memory has no place for CUDA graphs of the steps, which make them up to twice as fast; try a smaller "
@@ -123,15 +121,9 @@ def load(config: Config, inputs: Inputs, folder: Path, progress: Progress, ranks
     if config.target_psnr is not None:
         scene = _with_validation_photos(config.target_psnr, scene, progress)
     run = prepare(config, scene, inputs, folder, progress, ranks)
-
-    @cache
-    def contents() -> "LiveContents":
-        from stages.viewer.live import LiveContents  # most trainings are not watched
-
-        return LiveContents(inputs["normalise"])
-
+    contents = LiveContents(inputs["normalise"])
     run.live = LiveFolder(
-        folder, lambda shown: contents().save(shown, run.trainer.model, _field_info(config, scene, run))
+        folder, lambda shown: contents.save(shown, run.trainer.model, _field_info(config, scene, run))
     )
     say_if_inexact(config, progress)
     return Training(config, scene, run, earlier)

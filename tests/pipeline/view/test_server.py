@@ -221,7 +221,10 @@ def test_a_running_training_is_shown_without_loading_torch(running: RunningTrain
     assert done.stdout == "True False\n"
 
 
-def test_a_page_gets_its_first_field_before_torch_is_loaded(running: RunningTraining) -> None:
+def test_a_page_gets_its_first_field_before_torch_is_loaded(
+    running: RunningTraining, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.view.server.DRAW_SECONDS", 0.0)
     server, loaded = ViewServer(running.root), threading.Event()
     server.state.prepare = loaded.set
     serving = threading.Thread(target=server.run)
