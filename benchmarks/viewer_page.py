@@ -7,10 +7,12 @@
 A row per test photo: PSNR between the page's picture and the renderer's, at SIDE pixels, without distortion: of the
 field as it was trained, and in the bits that the page has; samples per pixel; how much worse the renderer's picture
 scores against the page's small photo in these bits; how much better or worse the page's picture does. With --truth (of
-`pipeline demo`'s photos) also lengths between points that are clicked: the median error of LENGTHS of them.
+`pipeline demo`'s photos) also lengths between points that are clicked, LENGTHS of them: the median error, and by how
+much the median one is too long.
 """
 
 import argparse
+import math
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -81,11 +83,24 @@ def pictures(page: Viewer, renderer: Renderer, info: dict[str, Any], scene: Scen
     }
 
 
-def length_error(page: Viewer, truth: Truth, scene: Scene, view: View, index: int) -> float:
-    """In percent, the median over pairs of clicked pixels."""
-    names = [each.name for each in scene.views if each.name in truth.poses]
-    of_scene = np.stack([each.scene_from_camera[:, 3] for each in scene.views if each.name in truth.poses])
-    scale = align(of_scene, np.stack([truth.poses[name][:, 3] for name in names])).scale
+def true_points(truth: Truth, scene: Scene, view: View, directions: np.ndarray) -> tuple[np.ndarray, float]:
+    """What rays of ``view`` (n, 3; its camera's frame) meet first of the true scene, in its frame, and its units per
+    scene unit.
+
+    The page's own rays, brought there by all cameras together: those of the true camera pass beside them by what the
+    principal point is off, and would meet other points of the surface.
+    """
+    views = [each for each in scene.views if each.name in truth.poses]
+    centres = np.stack([each.scene_from_camera[:, 3] for each in views])
+    truth_from_scene = align(centres, np.stack([truth.poses[each.name][:, 3] for each in views]))
+    pose = torch.tensor(truth_from_scene.pose(view.scene_from_camera)).float()
+    rays = rays_of_view(torch.tensor(directions).float(), pose, 0.0, math.inf)
+    distance = still_life(truth.seed).intersect(rays.origins, rays.directions).amin(0)
+    return (rays.origins + distance[:, None] * rays.directions).numpy(), truth_from_scene.scale
+
+
+def length_errors(page: Viewer, truth: Truth, scene: Scene, view: View, index: int) -> dict[str, float]:
+    """In percent, over pairs of clicked pixels: the median error, and the median of what lengths are too long by."""
     page.run(f"viewer.showPhoto({index})")
     page.until(f"viewer.photo === {index}")
     width, height = page.run("[viewer.canvas.width, viewer.canvas.height]")
@@ -95,19 +110,19 @@ def length_error(page: Viewer, truth: Truth, scene: Scene, view: View, index: in
     at = np.stack([(clicks[:, 0] - lens["cx"]) / lens["fx"], (clicks[:, 1] - lens["cy"]) / lens["fy"]], axis=1)
     directions = np.concatenate([at, np.ones((len(at), 1))], axis=1)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    pose = torch.tensor(truth.poses[view.name]).float()
-    rays = rays_of_view(torch.tensor(directions).float()[None], pose, 0.0, 100.0).each(lambda part: part[0])
-    distance = still_life(truth.seed).intersect(rays.origins, rays.directions).amin(0)
-    known = (rays.origins + distance[:, None] * rays.directions).numpy()
+    known, scale = true_points(truth, scene, view, directions)
     errors = []
-    for i in range(0, len(clicks), 2):
-        true = np.linalg.norm(known[i] - known[i + 1])
-        measure = f"viewer.measured = []; viewer.measure({clicks[i, 0]}, {clicks[i, 1]}); "
-        page.run(f"() => {{ {measure} viewer.measure({clicks[i + 1, 0]}, {clicks[i + 1, 1]}); }}")
+    for one, other in np.arange(len(clicks)).reshape(-1, 2):
+        if not np.isfinite(known[[one, other]]).all():  # one of the clicks shows the sky
+            continue
+        true = np.linalg.norm(known[one] - known[other])
+        measures = "; ".join(f"viewer.measure({x}, {y})" for x, y in clicks[[one, other]])
+        page.run(f"() => {{ viewer.measured = []; {measures}; }}")
         found = page.run("viewer.measured.length === 2 ? norm(subtract(...viewer.measured)) : null")
-        if found is not None and np.isfinite(true) and true > MIN_LENGTH:
-            errors.append(abs(found * scale / true - 1))
-    return round(100 * float(np.median(errors)), 2)
+        if found is not None and true > MIN_LENGTH:
+            errors.append(100 * (found * scale / true - 1))
+    figures = {"length_error_percent": np.median(np.abs(errors)), "length_bias_percent": np.median(errors)}
+    return {name: round(float(value), 2) for name, value in figures.items()}
 
 
 def main() -> None:
@@ -130,7 +145,7 @@ def main() -> None:
             for index in tests:
                 figures = pictures(page, load_renderer(train), read_json(train / "field.json"), scene, index)
                 if truth is not None and scene.views[index].name in truth.poses:
-                    figures["length_error_percent"] = length_error(page, truth, scene, scene.views[index], index)
+                    figures |= length_errors(page, truth, scene, scene.views[index], index)
                 record.add(scene=root.name.removesuffix(".nerf"), photo=scene.views[index].name, **figures)
             page.close()
 

@@ -42,6 +42,7 @@ HEADERS = {
 }
 NICENESS = 10  # the training goes first
 LINGER_SECONDS = 10.0  # at most, after the run during which it serves, for pages to get the last field
+DRAW_SECONDS = 15.0  # that a page may take to draw its first field on cores that train
 OPEN_SECONDS = 4.0  # a page that has not asked for so long is closed: longer than SLOW_POLL_MS in live.js
 
 
@@ -69,6 +70,7 @@ class ViewServer:
         self.url = f"http://{ADDRESS}:{self.port}/{self.token}/"
         self.state = WorkspaceState(root)
         self.asked, self.served_last = -math.inf, math.inf  # when a page last asked; when one got the last field
+        self.has_shown = threading.Event()  # a page has got a field
         self.server = uvicorn.Server(
             uvicorn.Config(
                 self.app(),
@@ -83,10 +85,17 @@ class ViewServer:
     def run(self) -> None:
         """Until Ctrl-C, which arrives as KeyboardInterrupt, or :meth:`stop`."""
         # Before the niceness, which is a thread's own on Linux: on cores that train, loading torch would take a minute.
-        threading.Thread(target=self.state.prepare, daemon=True).start()
+        threading.Thread(target=self._prepare, daemon=True).start()
         if hasattr(os, "nice"):
             os.nice(NICENESS)
         self.server.run(sockets=[self.listener])
+
+    def _prepare(self) -> None:
+        """For the end of the training. Of one that runs already a page first gets and draws a field, on these cores."""
+        if self.state.training().phase == "training":
+            self.has_shown.wait()
+            time.sleep(DRAW_SECONDS)
+        self.state.prepare()
 
     def stop(self) -> None:
         """From another thread: end soon."""
@@ -151,6 +160,8 @@ class ViewServer:
     def _field(self, request: Request) -> Response:
         name = request.path_params["name"]
         content = self.state.field(name)
+        if content is not None:
+            self.has_shown.set()
         if content is not None and name == FINISHED:
             self.served_last = time.monotonic()
         return _packed(content)

@@ -4,21 +4,21 @@ All of it comes from files, read anew each time, so it does not matter which sid
 """
 
 import json
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock
 from typing import TYPE_CHECKING, Any, Literal
 
 from pipeline.engine import manifest_file
 from pipeline.engine.manifest_file import BadManifest, Manifest
 from pipeline.engine.workspace import Workspace
-from stages import viewer
 from stages.contract import StageError
-from stages.train.live import LIVE, STATE, ask_to_finish, touch
-from stages.viewer.page import binary
+from stages.scale import metres_per_unit
+from stages.train.live import FIELD, LIVE, SCENE, STATE, ask_to_finish, touch
 
 if TYPE_CHECKING:
+    from nerf.fields.interface import RadianceModel
     from stages.viewer.live import LiveContents
 
 Phase = Literal["waiting", "training", "stopped", "finished"]
@@ -39,30 +39,24 @@ class Training:
         """The name of its latest field; None before the first."""
         return FINISHED if self.phase == "finished" else self.told.get("field")
 
-    def field_folder(self, name: str) -> Path | None:
-        """Where the field of that name lies; None where it is not there any more."""
-        if self.folder is None or name != self.field:
+    def live_file(self, *at: str) -> bytes | None:
+        """What lies there in ``live/``; None where nothing does any more."""
+        if self.folder is None:
             return None
-        return self.folder if name == FINISHED else self.folder / LIVE / name
+        with suppress(FileNotFoundError):  # the training has gone on meanwhile: the page asks again
+            return self.folder.joinpath(LIVE, *at).read_bytes()
+        return None
 
 
 class WorkspaceState:
     """Answers the server's questions about one workspace. Its calls may come from any thread."""
 
     def __init__(self, root: Path) -> None:
-        self.workspace, self.lock = Workspace(root), Lock()
-        self.contents: LiveContents | None = None
-        self.of_scene: tuple[Path, ...] = ()
-        self.packed: tuple[str, bytes] = ("", b"")
+        self.workspace = Workspace(root)
 
     def prepare(self) -> None:
-        """Load what packs fields, which takes seconds, and pack the one that a running training has, before the first
-        page asks for it."""
+        """Load what packs the field of a finished training, which takes seconds."""
         import stages.viewer.live  # noqa: F401
-
-        training = self.training()
-        if training.phase == "training" and training.field:
-            self.field(training.field)
 
     def training(self) -> Training:
         """The training that the workspace's recorded run has, or is to have."""
@@ -87,7 +81,14 @@ class WorkspaceState:
         if training.phase == "training" and training.folder is not None:
             touch(training.folder)
         told = {name: value for name, value in training.told.items() if name != "field"}
-        return told | {"phase": training.phase, "key": training.key, "field": training.field}
+        now = {"phase": training.phase, "key": training.key, "field": training.field, "metres_per_unit": self._metres()}
+        return told | now
+
+    def _metres(self) -> float | None:
+        """Per unit of the sfm frame; None where that is unknown, or not yet."""
+        with suppress(KeyError, StageError):
+            return metres_per_unit(self.workspace.folder("scale", self._keys()["scale"]))
+        return None
 
     def finish(self) -> bool:
         """Ask the training to end early; False where none runs."""
@@ -107,43 +108,33 @@ class WorkspaceState:
 
     def scene(self) -> bytes | None:
         """Cameras, points and what else does not change; None before there is a field."""
-        with self.lock:
-            training = self.training()
-            folder = training.field_folder(training.field) if training.field else None
-            if folder is None or (contents := self._contents()) is None:
-                return None
-            try:
-                return binary(contents.scene_contents(folder))
-            except (FileNotFoundError, StageError):  # the training has gone on meanwhile: the page asks again
-                return None
+        training = self.training()
+        if training.phase != "finished":
+            return training.live_file(SCENE)
+        return self._of_finished(training, lambda contents, _, info: contents.scene_contents(info))
 
     def field(self, name: str) -> bytes | None:
-        """The field of that name, that of a snapshot packed once for all pages; None where it is not the latest."""
-        with self.lock:
-            if self.packed[0] == name and name != FINISHED:
-                return self.packed[1]
-            folder = self.training().field_folder(name)
-            if folder is None or (contents := self._contents()) is None:
-                return None
-            try:
-                self.packed = name, binary(contents.field_contents(folder))
-            except (FileNotFoundError, StageError):
-                return None
-            return self.packed[1]
+        """The field of that name; None where it is not the latest."""
+        training = self.training()
+        if name != training.field:
+            return None
+        if name != FINISHED:
+            return training.live_file(name, FIELD)
+        return self._of_finished(training, lambda contents, model, info: contents.field_contents(model, info))
 
-    def _contents(self) -> "LiveContents | None":
-        """What packs fields of the scene as it is now; None before that is known."""
+    def _of_finished(
+        self, training: Training, packed: "Callable[[LiveContents, RadianceModel, dict[str, Any]], bytes]"
+    ) -> bytes | None:
+        """What is packed of a finished training, whose page is not there yet; None where it cannot be read."""
+        from stages.io.field_files import load_field
         from stages.viewer.live import LiveContents
 
-        keys = self._keys()
-        read = [name for name in viewer.STAGE.inputs if name in keys and name != "train"]
-        folders = {name: self.workspace.folder(name, keys[name]) for name in read}
-        there = {name: folder for name, folder in folders.items() if (folder / manifest_file.NAME).is_file()}
-        if "normalise" not in there:
+        assert training.folder is not None
+        try:
+            contents = LiveContents(self.workspace.folder("normalise", self._keys()["normalise"]))
+            return packed(contents, *load_field(training.folder, renders=False))
+        except (FileNotFoundError, KeyError, StageError):  # another run has begun meanwhile: the page asks again
             return None
-        if self.contents is None or self.of_scene != tuple(there.values()):
-            self.contents, self.of_scene = LiveContents(there), tuple(there.values())
-        return self.contents
 
     def _finished(self, stage: str, keys: dict[str, str]) -> Manifest | None:
         """What the finished ``stage`` of these keys says of itself; None where there is none."""

@@ -1,9 +1,10 @@
 """What a running training shows to whoever watches, and what they may ask of it: the files in ``live/`` of its folder.
 
 A watcher (pipeline/view) touches WATCHED while a page is open. Only then does the training write: STATE every
-POLL_SECONDS, and the field, as a finished training has it, every SNAPSHOT_SECONDS or as rarely as MAX_FRACTION of the
-time demands. Where FINISH lies the training is to end early. Neither side waits for the other, and either may die at
-any time: files appear whole, and of all that lies here training reads nothing but that FINISH is there.
+POLL_SECONDS, SCENE once, and the field every SNAPSHOT_SECONDS or as rarely as MAX_FRACTION of the time demands, both
+as the page reads them: a watcher need not load what packs them, which takes seconds on cores that train. Where FINISH
+lies the training is to end early. Neither side waits for the other, and either may die at any time: files appear
+whole, and of all that lies here training reads nothing but that FINISH is there.
 """
 
 import math
@@ -16,18 +17,20 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from stages.contract import StageError
 from stages.io.files import write_json
 
 LIVE, WATCHED, FINISH, STATE = "live", "watched", "finish", "state.json"
+SCENE, FIELD = "scene.bin", "field.bin"  # beside STATE, and in the folder of each snapshot
 POLL_SECONDS = 1.0  # between two looks at WATCHED: two system calls, all that a training nobody watches pays
 FORGET_SECONDS = 5.0  # after the last touch nobody is there any more
 SNAPSHOT_SECONDS = 4.0  # between two fields that are written, at least
-MAX_FRACTION = 0.01  # of a watched training's time that goes into them; a page's server takes about as much beside it
+MAX_FRACTION = 0.01  # of a watched training's time that goes into them
 KEPT = 2  # fields: the one that is read may be the last but one
 
 
 class LiveFolder:
-    """``live/`` in the ``folder`` of a training. ``save(folder)`` writes the field as it is now."""
+    """``live/`` in the ``folder`` of a training. ``save(folder)`` writes FIELD as it is now, and SCENE beside it."""
 
     def __init__(self, folder: Path, save: Callable[[Path], None]) -> None:
         self.root, self.save = folder / LIVE, save
@@ -60,9 +63,10 @@ class LiveFolder:
 
     def show(self, state: dict[str, Any]) -> None:
         """Write ``state`` with the name of the latest field, and that field if it is due. Nothing here ends a training:
-        a full disk is said by those whose files matter, a figure that is not finite by the loop."""
+        a full disk is said by those whose files matter, a figure that is not finite by the loop, a field that no page
+        shows by stage viewer."""
         if time.monotonic() >= self.next_snapshot:
-            with suppress(OSError, ValueError):
+            with suppress(OSError, ValueError, StageError):
                 self._save_field()
         with suppress(OSError, ValueError):
             temporary = self.root / f"{STATE}.tmp"

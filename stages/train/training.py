@@ -54,6 +54,7 @@ from stages.train.validation_images import (
     held_out_evaluation,
     with_validation_split,
 )
+from stages.viewer.live import LiveContents
 
 LACKS_MEMORY = (
     "the GPU's memory has no place for CUDA graphs of the steps, which make them up to twice as fast; try a smaller "
@@ -120,7 +121,10 @@ def load(config: Config, inputs: Inputs, folder: Path, progress: Progress, ranks
     if config.target_psnr is not None:
         scene = _with_validation_photos(config.target_psnr, scene, progress)
     run = prepare(config, scene, inputs, folder, progress, ranks)
-    run.live = LiveFolder(folder, lambda shown: save_field(shown, run.trainer.model, _field_info(config, scene, run)))
+    contents = LiveContents(inputs["normalise"])
+    run.live = LiveFolder(
+        folder, lambda shown: contents.save(shown, run.trainer.model, _field_info(config, scene, run))
+    )
     say_if_inexact(config, progress)
     return Training(config, scene, run, earlier)
 

@@ -163,7 +163,7 @@ def gains_of(effects: tuple[ColourEffect, ...]) -> dict[str, list[float]]:
 
 def scene_header(scene: Scene, inputs: Inputs) -> dict[str, Any]:
     usual, sfm_from_scene = median_camera(scene), scene.scene_from_sfm.inverse()
-    metres = metres_per_unit(inputs["scale"]) if "scale" in inputs else None  # while a lone stage train is watched
+    metres = metres_per_unit(inputs["scale"]) if "scale" in inputs else None  # while it trains
     return {
         "bounded": scene.bounded,
         "has_alpha": scene.has_alpha,

@@ -1,23 +1,23 @@
 """What the page shows of a running training: its scene once, then field after field, packed for speed and not for size.
 
-A field as :func:`stages.io.field_files.save_field` wrote it becomes 16 bits a number, row by row: about as much work as
-reading it, and lossless to the eye. The file that stage viewer writes in the end is smaller.
+The training packs both, for it has them at hand: a field becomes 16 bits a number, row by row, which is about as much
+work as writing it, and lossless to the eye. The file that stage viewer writes in the end is smaller.
 """
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors.torch import load
 
 from nerf.effects.appearance import AppearanceModel
 from nerf.fields.hash_grid import HashGridField
+from nerf.fields.interface import RadianceModel
 from nerf.geometry.scene import Scene
 from stages.contract import Inputs
 from stages.effects.image_effects import new_view_effects, new_view_words, photo_effects
-from stages.io.field_files import load_field
-from stages.io.files import read_json, read_scene, read_tensors
+from stages.io.files import read_scene, read_tensors
 from stages.io.photos import spread
+from stages.train.live import FIELD, SCENE
 from stages.viewer.contents import (
     COMPARED_VIEWS,
     Contents,
@@ -27,57 +27,47 @@ from stages.viewer.contents import (
     sparse_points,
     view_header,
 )
+from stages.viewer.page import binary
 from stages.viewer.tables import FEATURES, description, quantised, sections
 
 
 class LiveContents:
-    """Packs what the ``inputs`` of stage viewer hold, stage train aside; its fields come folder by folder."""
+    """Packs fields of the scene in the finished folder of ``normalise``. ``info`` is what field.json says of them."""
 
-    def __init__(self, inputs: Inputs) -> None:
-        self.inputs, self.scene = inputs, read_scene(inputs["normalise"])
-        self.settings: Any = None
-        self.grid: HashGridField | None = None  # into which the next field is loaded, too
+    def __init__(self, normalise: Path) -> None:
+        self.inputs: Inputs = {"normalise": normalise}
+        self.scene = read_scene(normalise)
 
-    def scene_contents(self, folder: Path) -> Contents:
-        """All but the field, which the ``folder`` of one tells the effects of."""
-        field = read_json(folder / "field.json")
+    def save(self, folder: Path, model: RadianceModel, info: dict[str, Any]) -> None:
+        """Write FIELD into ``folder``, and SCENE beside that folder unless it is there."""
+        if not (folder.parent / SCENE).exists():
+            temporary = folder / SCENE
+            temporary.write_bytes(self.scene_contents(info))
+            temporary.replace(folder.parent / SCENE)
+        (folder / FIELD).write_bytes(self.field_contents(model, info))
+
+    def scene_contents(self, info: dict[str, Any]) -> bytes:
+        """All but the field, and metres per unit, which no training knows."""
         header = {
             "scene": scene_header(self.scene, self.inputs),
-            "exposure": "exposure" in field["effects"],
-            "appearance": new_view_words(field),
+            "exposure": "exposure" in info["effects"],
+            "appearance": new_view_words(info),
             "comparison": None,
             "inverse_depth": _inverse_depths(self.scene, self.inputs),
-            "views": [view_header(self.scene, view, field) for view in self.scene.views],
+            "views": [view_header(self.scene, view, info) for view in self.scene.views],
         }
-        return Contents(header, {"palette": palette()} | sparse_points(self.inputs), None)
+        return binary(Contents(header, {"palette": palette()} | sparse_points(self.inputs), None))
 
-    def field_contents(self, folder: Path) -> Contents:
-        """The field in ``folder``, and the exposure of each photo. A field that browsers cannot draw is None.
-
-        Raises FileNotFoundError where the training has removed it meanwhile.
-        """
-        field = read_json(folder / "field.json")
-        grid = self._loaded(field, folder)
-        if grid is None:
-            return Contents({"field": None}, {}, None)
-        table = quantised(grid.layout, grid.table, 16)
-        gains = gains_of(new_view_effects(field)) | {"background": field["background"]}
-        photos = [gains_of(photo_effects(field, self.scene, view)) for view in self.scene.views]
-        header = {"field": description(grid, table, by_rows=True) | gains, "gains": photos}
-        return Contents(header, sections(grid, table, by_rows=True), None)
-
-    def _loaded(self, field: dict[str, Any], folder: Path) -> HashGridField | None:
-        """The field in ``folder``, loaded into the one before where both have the same sizes."""
-        if field["kind"] != "grid" or field["settings"]["features_per_level"] != FEATURES:
-            return None
-        if self.grid is not None and self.settings == field["settings"]:
-            self.grid.load_state_dict(load((folder / "field.safetensors").read_bytes()), assign=True)
-            return self.grid
-        model, _ = load_field(folder, renders=False)
+    def field_contents(self, model: RadianceModel, info: dict[str, Any]) -> bytes:
+        """The field, and the exposure of each photo. A field that browsers cannot draw is None."""
         grid = model.model if isinstance(model, AppearanceModel) else model
-        assert isinstance(grid, HashGridField)
-        self.settings, self.grid = field["settings"], grid
-        return grid
+        if not isinstance(grid, HashGridField) or grid.settings.features_per_level != FEATURES:
+            return binary(Contents({"field": None}, {}, None))
+        table = quantised(grid.layout, grid.table, 16)
+        gains = gains_of(new_view_effects(info)) | {"background": info["background"]}
+        photos = [gains_of(photo_effects(info, self.scene, view)) for view in self.scene.views]
+        header = {"field": description(grid, table, by_rows=True) | gains, "gains": photos}
+        return binary(Contents(header, sections(grid, table, by_rows=True), None))
 
 
 def _inverse_depths(scene: Scene, inputs: Inputs) -> list[float]:

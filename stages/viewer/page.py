@@ -50,13 +50,14 @@ def packed(contents: "Contents") -> str:
 def binary(contents: "Contents") -> bytes:
     """The header's length, the header in JSON, the sections at the places that it says, counted from behind the header,
     each as typed arrays want it."""
-    places, body = dict[str, tuple[int, int]](), bytearray()
+    places, parts, length = dict[str, tuple[int, int]](), list[bytes](), 0
     for name, content in contents.sections.items():
-        places[name] = len(body), len(content)
-        body += content + bytes(-len(content) % ALIGNMENT)
+        places[name] = length, len(content)
+        parts += [content, bytes(-len(content) % ALIGNMENT)]
+        length += len(content) + len(parts[-1])
     header = json.dumps({**contents.header, "sections": places}, allow_nan=False).encode()
     header += b" " * (-(len(header) + 4) % ALIGNMENT)
-    return struct.pack("<I", len(header)) + header + bytes(body)
+    return b"".join([struct.pack("<I", len(header)), header, *parts])
 
 
 def page(kind: Literal["still", "not drawn", "live"], payload: str = "") -> str:

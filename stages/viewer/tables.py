@@ -57,10 +57,10 @@ class Table:
 
 def quantised(layout: GridLayout, table: Float[Tensor, "rows 4"], bits: Bits) -> Table:
     """The table in so many bits a number."""
-    values = table.detach().cpu().numpy()
     levels = len(layout.resolutions)
     if bits == 16:
-        return Table(layout, values.astype(np.float16), np.ones((levels, FEATURES), np.float32))
+        return Table(layout, table.detach().half().cpu().numpy(), np.ones((levels, FEATURES), np.float32))
+    values = table.detach().cpu().numpy()
     codes, scales = np.empty(values.shape, np.int8), np.empty((levels, FEATURES), np.float32)
     for level in range(levels):
         rows = _rows(layout, level)

@@ -5,6 +5,7 @@ const POLL_MS = 1000;
 const SLOW_POLL_MS = 3000; // where nothing changes: less than OPEN_SECONDS of the server
 const PATIENCE_MS = 15_000; // fields may come faster than a picture fills in: it is finished first, unless that takes longer
 const STRIP_FRACTION = 0.1; // of the time in which pixels fill in: without a graphics chip the training and the page share the cores
+const NO_FIELD = "No training is running, and there is no field yet. pipeline status says how far the run came; pipeline resume continues it.";
 const SVG = "http://www.w3.org/2000/svg";
 
 class Follower {
@@ -77,7 +78,11 @@ class Follower {
       return false;
     }
     const section = (part) => field.section(part) ?? scene.section(part);
-    if (!window.viewer) await open({ ...scene, field: field.field, section });
+    if (!window.viewer) {
+      const metres = this.state.metres_per_unit, [row] = scene.scene.sfm_from_scene; // a rotation times a scale
+      scene.scene.metres_per_unit = metres && metres * norm(row.slice(0, 3));
+      await open({ ...scene, field: field.field, section });
+    }
     window.viewer.renderer.stripFraction = this.state.phase === "training" ? STRIP_FRACTION : 1;
     window.viewer.replace(field);
     return true;
@@ -94,7 +99,7 @@ class Follower {
     byId("live-phase").textContent = {
       waiting: "The training has not begun.",
       training: finishing ? `Finishing${at}` : `Training${at}`,
-      stopped: `No training is running${at}. pipeline resume continues it.`,
+      stopped: at ? `The training was stopped${at}. pipeline resume continues it.` : NO_FIELD,
       finished: `Finished${at}`,
     }[phase];
     const figures = [
@@ -109,7 +114,7 @@ class Follower {
     byId("finish").disabled = Boolean(finishing || this.asked);
     byId("finish").textContent = finishing ? "Finishing …" : this.asked ? "Asked to finish …" : "Finish now";
     drawCurve(byId("live-curve"), curve ?? []);
-    if (!this.shown && !this.cannot) say({ waiting: "Waiting for the training to begin …", training: "Waiting for the first field …", stopped: "There is no field to show yet.", finished: "Unpacking the field …" }[phase]);
+    if (!this.shown && !this.cannot) say({ waiting: "Waiting for the training to begin …", training: "Waiting for the first field …", stopped: NO_FIELD, finished: "Unpacking the field …" }[phase]);
   }
 }
 

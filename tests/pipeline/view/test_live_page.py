@@ -26,9 +26,12 @@ def browser() -> Iterator[Any]:
 
 def test_it_follows_a_training_to_the_end_it_asks_for(browser: Any, tmp_path: Path) -> None:
     with RunningTraining(tmp_path) as training:
+        write_json(training.inputs["scale"] / "scale.json", {"metres_per_unit": 0.5})
         server = Served(training)
         page = Viewer(browser, server.server.url)
         page.until("follower.shown")
+        metres = 0.5 / training.scene.scene_from_sfm.scale
+        assert page.run("viewer.contents.scene.metres_per_unit") == pytest.approx(metres)
         first, field = page.drawn(), page.run("follower.shown")
         assert page.run("document.querySelectorAll('b').length") == 0, "a name is text and no HTML"
         page.until(f"follower.shown !== '{field}' && document.querySelector('#live-curve polyline')")
@@ -93,6 +96,7 @@ def test_it_says_when_its_server_is_gone(browser: Any, tmp_path: Path) -> None:
     server = Served(RunningTraining(tmp_path))
     page = Viewer(browser, server.server.url)
     page.until("document.getElementById('live-phase').textContent.includes('No training')")
+    assert page.run("byId('live-phase').textContent === byId('message').textContent"), "also beside a closed menu"
     server.close()
     page.until("document.getElementById('live-phase').textContent.includes('server has ended')")
     page.close()

@@ -205,6 +205,45 @@ def test_it_loads_what_packs_fields_before_it_yields(tmp_path: Path, monkeypatch
     server.listener.close()
 
 
+def test_a_running_training_is_shown_without_loading_torch(running: RunningTraining, served: Served) -> None:
+    """It takes seconds, on cores that train many."""
+    served.until(lambda told: told["field"])
+    program = f"""if True:
+        import sys, time
+        from pathlib import Path
+        from pipeline.view.server import ViewServer
+        state = ViewServer(Path({str(running.root)!r})).state
+        ends, field = time.monotonic() + {WAIT_SECONDS}, None
+        while not field and time.monotonic() < ends:  # each time the latest
+            field = state.field(state.watched()["field"])
+        print(len(field) > len(state.scene()) > 0, "torch" in sys.modules)"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "True False\n"
+
+
+def test_a_page_gets_its_first_field_before_torch_is_loaded(
+    running: RunningTraining, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.view.server.DRAW_SECONDS", 0.0)
+    server, loaded = ViewServer(running.root), threading.Event()
+    server.state.prepare = loaded.set
+    serving = threading.Thread(target=server.run)
+    serving.start()
+
+    def asked(at: str) -> bytes:
+        with urllib.request.urlopen(server.url + at, timeout=60) as answer:
+            return answer.read()
+
+    asked("state")
+    before, ends = loaded.wait(1.0), time.monotonic() + WAIT_SECONDS
+    while not loaded.is_set() and time.monotonic() < ends:
+        asked(f"field/{json.loads(asked('state'))['field']}")
+        loaded.wait(0.1)
+    server.stop()
+    serving.join()
+    assert not before and loaded.is_set()
+
+
 def test_tokens_cannot_be_guessed(tmp_path: Path) -> None:
     servers = [ViewServer(tmp_path) for _ in range(3)]
     assert len({server.token for server in servers}) == 3 and all(len(server.token) == 32 for server in servers)
@@ -308,7 +347,8 @@ def test_two_servers_show_one_training_to_its_end(tmp_path: Path) -> None:
 def test_without_a_training_it_says_so(tmp_path: Path) -> None:
     training = RunningTraining(tmp_path)
     server = Served(training)
-    assert server.ask().told == {"phase": "stopped", "key": KEYS["train"], "field": None}
+    told = {"phase": "stopped", "key": KEYS["train"], "field": None, "metres_per_unit": None}
+    assert server.ask().told == told
     assert server.ask("scene").status == 204
     assert server.ask("finish", "POST", Origin=f"http://127.0.0.1:{server.server.port}").told == {"asked": False}
     with training.workspace:

@@ -9,6 +9,7 @@ import torch
 
 from nerf.training.step_schedule import DECAY_START_PROGRESS
 from nerf.training.trainer import NonFinite
+from stages.contract import StageError
 from stages.train import live, loop
 from stages.train.live import FINISH, LIVE, STATE, LiveFolder, ask_to_finish, touch
 from stages.train.loop import TrainingRun
@@ -86,6 +87,14 @@ def test_a_full_disk_ends_no_training_and_fills_no_further(tmp_path: Path) -> No
         folder.show({"step": step})
     assert len(tried) == 1 and not tried[0].exists(), "the next one is not due at once"
     assert json.loads((tmp_path / LIVE / STATE).read_text()) == {"step": 3, "field": None}
+
+
+def test_a_field_that_cannot_be_packed_ends_no_training(tmp_path: Path) -> None:
+    def cannot(folder: Path) -> None:
+        raise StageError("viewer.effect", "cannot pack the field", "no shader knows an effect", "")
+
+    LiveFolder(tmp_path, cannot).show({"step": 1})
+    assert json.loads((tmp_path / LIVE / STATE).read_text()) == {"step": 1, "field": None}
 
 
 def test_what_cannot_be_touched_is_not_watched(tmp_path: Path) -> None:

@@ -258,6 +258,8 @@ LAYOUT = """() => {
     scrolls: document.documentElement.scrollWidth > innerWidth || byId("panel").scrollWidth > byId("panel").clientWidth,
     scene: box("canvas").width * box("canvas").height > 0.5 * innerWidth * innerHeight,
     slider: byId("photo-share").offsetWidth >= 100,
+    options: [...document.querySelectorAll(".option")].map((e) => e.getClientRects().length),
+    gap: document.querySelector("#path > p").getBoundingClientRect().top - box("path-save").bottom >= 6,
   };
 }"""
 
@@ -269,10 +271,30 @@ def test_controls_fit_screens_of_any_size(ball: Viewer, size: tuple[int, int]):
     ball.run("() => { if (byId('panel').hidden) byId('menu').click(); }")
     ball.run("document.querySelectorAll('details').forEach((each) => (each.open = true))")
     ball.run("viewer.photo = 0; viewer.changed()")
-    assert ball.run(LAYOUT) == {"outside": [], "overlap": [], "scrolls": False, "scene": True, "slider": True}
+    fits = {"outside": [], "overlap": [], "scrolls": False, "scene": True, "slider": True, "options": [1], "gap": True}
+    assert ball.run(LAYOUT) == fits
     ball.run("document.querySelectorAll('details').forEach((each) => (each.open = false))")
     ball.run("viewer.leavePhoto(); byId('menu').click()")
     ball.page.set_viewport_size({"width": 120, "height": 90})
+
+
+CONTRASTS = """() => {
+  const channels = (colour) => colour.match(/[0-9.]+/g).slice(0, 3).map((x) => x / 255);
+  const linear = (x) => (x > 0.04045 ? ((x + 0.055) / 1.055) ** 2.4 : x / 12.92);
+  const light = (colour) => dot(channels(colour).map(linear), [0.2126, 0.7152, 0.0722]) + 0.05;
+  const contrast = (a, b) => Math.max(light(a), light(b)) / Math.min(light(a), light(b));
+  const card = getComputedStyle(byId("panel")).backgroundColor, of = (id) => getComputedStyle(byId(id));
+  return [contrast(of("reset").color, card), contrast(of("path-seconds").borderColor, card)];
+}"""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_controls_can_be_told_from_what_is_behind(ball: Viewer, scheme: Any):
+    """WCAG 2.2, 1.4.3 and 1.4.11: letters and outlines."""
+    ball.page.emulate_media(color_scheme=scheme)
+    text, outline = ball.run(CONTRASTS)
+    ball.page.emulate_media(color_scheme="light")
+    assert text >= 4.5 and outline >= 3
 
 
 def test_on_a_phone_a_chosen_photo_closes_the_menu(ball: Viewer):
