@@ -7,6 +7,7 @@ from stages.io.amounts import counted
 
 MAX_DOUBTFUL = 0.05  # fraction of the photos that are excluded, differ from global mapping, or are weakly linked
 MIN_AGREEING = 0.5  # share of the verified pairs
+MIN_LINKED = 0.95  # share of the photos that pairs which agree with either mapping link together
 MIN_SUPPORT = 0.9  # share of the pairs that agree with our poses must agree with the other mapping's, to cast doubt
 MAX_SHOWN = 8  # photos of a group
 MIN_SHOWN = 0.0001  # share of the extent: 0.00% would be no figure
@@ -123,8 +124,12 @@ def _differs(comparison: Mapping[str, Any] | None) -> TypeGuard[Mapping[str, Any
 
 def _is_refuted(comparison: Mapping[str, Any]) -> bool:
     """Whether clearly more verified pairs of the photos in question agree with the cameras than with those of the
-    mapping that was not taken."""
-    return comparison["agreeing_other"] < MIN_SUPPORT * comparison["agreeing"]
+    mapping that was not taken, or those that agree link all photos here, and there fall into groups."""
+    return _falls_apart(comparison) or comparison["agreeing_other"] < MIN_SUPPORT * comparison["agreeing"]
+
+
+def _falls_apart(comparison: Mapping[str, Any]) -> bool:
+    return comparison["linked_other"] < MIN_LINKED <= comparison["linked"]
 
 
 def _doubts_of_structure(repeated: Mapping[str, Any] | None) -> list[str]:
@@ -157,8 +162,10 @@ def _figures(registration: Mapping[str, Any]) -> str | None:
         said.append(f"the cameras agree with {pairs} (median error {check['error_px']:.2f} px{adjusted})")
     if _differs(comparison) and _is_refuted(comparison):
         name = "incremental" if comparison["taken"] else "global"
-        support = f"{comparison['agreeing_other']:,} of their image pairs agree with it and {comparison['agreeing']:,}"
-        said.append(f"{name} mapping gives {counted(len(comparison['different']))} other poses; {support} with these")
+        support = f"{comparison['agreeing_other']:,} of their image pairs agree with it and {comparison['agreeing']:,} with these"
+        if _falls_apart(comparison):
+            support = f"the image pairs that agree with it link only {comparison['linked_other']:.0%} of the photos"
+        said.append(f"{name} mapping gives {counted(len(comparison['different']))} other poses; {support}")
     elif _differs(comparison) and comparison["drift"]:
         name = "incremental" if comparison["taken"] else "global"
         bent = f"against {name} mapping the path is bent or stretched at {counted(len(comparison['different']))}"

@@ -19,16 +19,16 @@ from stages.sfm.colmap.joining import Piece, join_pieces
 from stages.sfm.colmap.mappers import incremental_options, map_incrementally
 from stages.sfm.colmap.model_check import (
     Candidate,
+    agreeing_pair_ids,
     agreeing_pairs,
     better,
     check_model,
     fragments_sequence,
-    pairs_agreeing_with_both,
     reasons,
     supported_runs,
     supported_steps,
 )
-from stages.sfm.colmap.model_comparison import compare_models, differ_by_drift, disagree
+from stages.sfm.colmap.model_comparison import compare_models, differ_by_drift, disagree, linked_share
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import copy_consistent_matches, deregister, drop_outside_main_segment, register_again
 from stages.sfm.extraction_and_matching import capture_sequence, consecutive_pairs
@@ -239,12 +239,14 @@ def _comparison(checked: CheckedModel, incremental: Any, other: Any, database: P
     they differ, how many verified pairs agree with either."""
     taken, rejected = checked.model, incremental if checked.model is other else other
     compared = compare_models(taken, rejected) | {"failed": None, "drift": False}
-    compared |= {"agreeing": None, "agreeing_other": None}
+    compared |= dict.fromkeys(("agreeing", "agreeing_other", "linked", "linked_other"))
     if compared["different"]:
         known = {id(one.model): one for one in checked.candidates}
         first, second = (known.get(id(one)) or _candidate(one, database, state) for one in (taken, rejected))
         compared["agreeing"], compared["agreeing_other"] = agreeing_pairs(first, second, compared["different"])
-        compared["drift"] = differ_by_drift(taken, rejected, pairs_agreeing_with_both(first, second))
+        pairs, shared = agreeing_pair_ids(first, second), {*taken.reg_image_ids()} & {*rejected.reg_image_ids()}
+        compared["linked"], compared["linked_other"] = (linked_share(shared, of) for of in pairs)
+        compared["drift"] = differ_by_drift(taken, rejected, pairs[0] & pairs[1])
     return compared | {"taken": taken is other}
 
 

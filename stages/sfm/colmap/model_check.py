@@ -170,14 +170,14 @@ def agreeing_pairs(first: Candidate, second: Candidate, files: Container[str]) -
     return count(first), count(second)
 
 
-def pairs_agreeing_with_both(first: Candidate, second: Candidate) -> set[tuple[int, int]]:
-    """The verified pairs (image ids) that agree with the poses of both models."""
+def agreeing_pair_ids(first: Candidate, second: Candidate) -> tuple[set[tuple[int, int]], ...]:
+    """The verified pairs (image ids) that agree with the poses of either model."""
 
     def agreeing(candidate: Candidate) -> set[tuple[int, int]]:
         ids, check = np.array(candidate.checked.ids), _under_smallest_tolerance(candidate, (first, second))
         return {(int(i), int(j)) for i, j in np.sort(ids[candidate.checked.matches.pairs[check.agrees]], axis=1)}
 
-    return agreeing(first) & agreeing(second)
+    return agreeing(first), agreeing(second)
 
 
 def _under_smallest_tolerance(candidate: Candidate, candidates: Sequence[Candidate]) -> PoseCheck:

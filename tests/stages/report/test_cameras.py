@@ -37,7 +37,11 @@ def check(**changed: Any) -> dict[str, Any]:
 
 def opinion(**changed: Any) -> dict[str, Any]:
     agree = {"photos": PHOTOS, "agree": PHOTOS, "different": [], "centre": 0.0006, "degrees": 0.02, "failed": None}
-    return agree | {"agreeing": 100, "agreeing_other": 100, "taken": False, "drift": False} | changed
+    return (
+        agree
+        | {"agreeing": 100, "agreeing_other": 100, "taken": False, "drift": False, "linked": 1.0, "linked_other": 1.0}
+        | changed
+    )
 
 
 def weak(*counts: int) -> list[dict[str, Any]]:
@@ -87,6 +91,7 @@ def test_each_kind_of_doubt_makes_the_cameras_doubtful(changed: dict[str, Any], 
         ({"global_mapping": opinion(different=files(3))}, 0),
         ({"global_mapping": opinion(different=files(40), agreeing_other=89)}, 0),
         ({"global_mapping": opinion(different=files(40), drift=True)}, 0),
+        ({"global_mapping": opinion(different=files(40), linked_other=0.94)}, 0),
         ({"global_mapping": {"failed": "global mapping found no model"}}, 0),
     ],
 )
@@ -103,6 +108,11 @@ def test_of_a_large_group_the_first_photos_are_shown() -> None:
 def test_weak_links_are_shown_largest_first() -> None:
     groups = camera_report(registration(check=check(weak_links=weak(1, 2, 3, 4, 5, 6, 1))), {}).groups
     assert [len(group.files) + group.more for group in groups] == [6, 5, 4, 3, 1 + 2 + 1]
+
+
+def test_a_global_mapping_that_falls_apart_casts_no_doubt() -> None:
+    said = camera_report(registration(global_mapping=opinion(different=files(40), linked_other=0.71)), {})
+    assert said.figures and re.findall(r"[\d.]*\d", said.figures)[3:] == ["40", "71"]
 
 
 def test_a_contradicted_global_mapping_casts_no_doubt() -> None:
