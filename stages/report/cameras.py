@@ -162,7 +162,8 @@ def _figures(registration: Mapping[str, Any]) -> str | None:
         said.append(f"the cameras agree with {pairs} (median error {check['error_px']:.2f} px{adjusted})")
     if _differs(comparison) and _is_refuted(comparison):
         name = "incremental" if comparison["taken"] else "global"
-        support = f"{comparison['agreeing_other']:,} of their image pairs agree with it and {comparison['agreeing']:,} with these"
+        agreeing, with_these = f"{comparison['agreeing_other']:,}", f"{comparison['agreeing']:,} with these"
+        support = f"{agreeing} of their image pairs agree with it and {with_these}"
         if _falls_apart(comparison):
             support = f"the image pairs that agree with it link only {comparison['linked_other']:.0%} of the photos"
         said.append(f"{name} mapping gives {counted(len(comparison['different']))} other poses; {support}")
