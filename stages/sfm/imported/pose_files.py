@@ -16,7 +16,7 @@ from stages.sfm.imported.colmap_model import read_colmap_model
 from stages.sfm.imported.conventions import AS_DECLARED, OF_COLMAP, OF_LLFF, OF_TRANSFORMS, PoseConvention
 from stages.sfm.imported.imported_poses import ImportedPoses
 from stages.sfm.imported.llff import read_llff_poses
-from stages.sfm.imported.transforms import read_transforms
+from stages.sfm.imported.transforms import read_transforms_poses
 
 
 def read_poses(
@@ -31,7 +31,7 @@ def read_poses(
     if cameras.suffix.lower() == LLFF:
         return read_llff_poses(cameras, photos, frames, convention)
     if _is_transforms(cameras):
-        return read_transforms(cameras, photos, frames, convention)
+        return read_transforms_poses(cameras, photos, frames, convention)
     return read_colmap_model(cameras, photos, convention)
 
 

@@ -46,7 +46,7 @@ class _Framed(NamedTuple):
     values: Mapping[str, Any]  # of the frame, and of its file what the frame has none of
 
 
-def read_transforms(
+def read_transforms_poses(
     cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str], convention: PoseConvention
 ) -> ImportedPoses:
     """Poses of a transforms file, or of a Blender-style folder of them. ``frames`` maps a file_path to a photo's name.
