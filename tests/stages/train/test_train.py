@@ -294,7 +294,7 @@ def test_plan_answers_everything_for_the_grid_field(
     inputs, _ = photographed(tmp_path, bounded=bounded)
     planned = train.plan(Config(), inputs, progress)
     assert (planned.field, planned.seconds, planned.space) == ("grid", 180, "bounded" if bounded else "contracted")
-    assert "180 s" in progress.said("train.photo-size")[0]
+    assert "3 min" in progress.said("train.photo-size")[0]
     assert (planned.downscale, planned.background) == (1.0, "random")
     assert None not in planned.grid.model_dump().values()
     assert planned.learning_rate == LEARNING_RATES["bounded" if bounded else "contracted"]
