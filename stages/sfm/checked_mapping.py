@@ -19,7 +19,6 @@ from stages.sfm.colmap.joining import Piece, join_pieces
 from stages.sfm.colmap.mappers import incremental_options, map_incrementally
 from stages.sfm.colmap.model_check import (
     Candidate,
-    agreeing_pair_ids,
     agreeing_pairs,
     better,
     check_model,
@@ -243,8 +242,11 @@ def _comparison(checked: CheckedModel, incremental: Any, other: Any, database: P
     if compared["different"]:
         known = {id(one.model): one for one in checked.candidates}
         first, second = (known.get(id(one)) or _candidate(one, database, state) for one in (taken, rejected))
-        compared["agreeing"], compared["agreeing_other"] = agreeing_pairs(first, second, compared["different"])
-        pairs, shared = agreeing_pair_ids(first, second), {*taken.reg_image_ids()} & {*rejected.reg_image_ids()}
+        pairs, shared = agreeing_pairs(first, second), {*taken.reg_image_ids()} & {*rejected.reg_image_ids()}
+        names = {*compared["different"]}
+        different = {image_id for image_id in shared if taken.image(image_id).name in names}
+        counts = [sum(not different.isdisjoint(pair) for pair in of) for of in pairs]
+        compared["agreeing"], compared["agreeing_other"] = counts
         compared["linked"], compared["linked_other"] = (linked_share(shared, of) for of in pairs)
         compared["drift"] = differ_by_drift(taken, rejected, pairs[0] & pairs[1])
     return compared | {"taken": taken is other}

@@ -56,12 +56,12 @@ def run_worker(
         if "result" in latest:
             return latest["result"]
         ended = _abandon_retry(latest, status, late, log)
-        if ended and not late:
+        if late:
+            raise _timeout(config.max_seconds, latest, skipped=ended is not None)
+        if ended:
             text = f"going on without the retry strategy {latest['strategy']!r}, because {ended.why}. Log: {log}"
             progress.note("sfm.strategy-crashed", text)
             continue
-        if late:
-            raise _timeout(config.max_seconds, latest, skipped=ended is not None)
         raise _worker_failed(status, latest["phase"], latest.get("fault") or _last_line(log), log)
 
 
@@ -119,7 +119,7 @@ def _abandon_retry(latest: Mapping[str, Any], status: int, late: bool, log: Path
     """Note that the retry strategy in which the worker failed is not to be tried again, and why; None where none is at
     work: the first strategy is always tried, and the final adjustment belongs to all."""
     first = latest["strategy"] == STRATEGIES[0].name
-    if first or latest["phase"] == "refining" or not (late or status) or _disk_is_full(log):
+    if first or latest["phase"] == "refining" or not (late or status) or _full_disk(log):
         return None
     # Also where it was killed: most often for want of memory, and then it would be every time.
     became = "was killed, most likely because memory ran out" if status == -signal.SIGKILL else "ended the program"
@@ -180,9 +180,11 @@ def _last_line(log: Path) -> str:
     return lines[-1].strip() if lines else "it printed no message"
 
 
-def _disk_is_full(log: Path) -> bool:
-    """COLMAP and its database report it in other words, or do not notice."""
-    return shutil.disk_usage(log.parent).free < MIN_FREE_BYTES
+def _full_disk(log: Path) -> str:
+    """A remark where the disk is full, else nothing: COLMAP and its database report it in other words, or do not
+    notice."""
+    free = shutil.disk_usage(log.parent).free
+    return f"; the disk is full, with {free / 2**20:.1f} MB free" if free < MIN_FREE_BYTES else ""
 
 
 def _timeout(limit: float, latest: Mapping[str, Any], skipped: bool) -> StageError:
@@ -196,8 +198,7 @@ def _timeout(limit: float, latest: Mapping[str, Any], skipped: bool) -> StageErr
 
 def _worker_failed(status: int, phase: str, last: str, log: Path) -> StageError:
     """``last``: the last message of the worker."""
-    if _disk_is_full(log):
-        last += f"; the disk is full, with {shutil.disk_usage(log.parent).free / 2**20:.1f} MB free"
+    last += _full_disk(log)
     if status < 0:
         name = signal.Signals(-status).name
         memory = status == -signal.SIGKILL

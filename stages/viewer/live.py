@@ -4,6 +4,7 @@ The training packs both, for it has them at hand: a field becomes 16 bits a numb
 work as writing it, and lossless to the eye. The file that stage viewer writes in the end is smaller.
 """
 
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,11 @@ class LiveContents:
 
     def __init__(self, normalise: Path) -> None:
         self.inputs: Inputs = {"normalise": normalise}
-        self.scene = read_scene(normalise)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """Read when there is somebody to show it to: every training has this at hand."""
+        return read_scene(self.inputs["normalise"])
 
     def save(self, folder: Path, model: RadianceModel, info: dict[str, Any]) -> None:
         """Write FIELD into ``folder``, and SCENE beside that folder unless it is there."""

@@ -159,18 +159,7 @@ def better(first: Candidate, second: Candidate) -> Candidate:
     return second if pairs[1] > pairs[0] else first
 
 
-def agreeing_pairs(first: Candidate, second: Candidate, files: Container[str]) -> tuple[int, int]:
-    """How many verified pairs with one of these images agree with the poses of either model."""
-
-    def count(candidate: Candidate) -> int:
-        (model, checked), check = candidate, _under_smallest_tolerance(candidate, (first, second))
-        among = np.array([model.image(image_id).name in files for image_id in checked.ids], bool)
-        return int((check.agrees & among[checked.matches.pairs].any(axis=1)).sum())
-
-    return count(first), count(second)
-
-
-def agreeing_pair_ids(first: Candidate, second: Candidate) -> tuple[set[tuple[int, int]], ...]:
+def agreeing_pairs(first: Candidate, second: Candidate) -> tuple[set[tuple[int, int]], ...]:
     """The verified pairs (image ids) that agree with the poses of either model."""
 
     def agreeing(candidate: Candidate) -> set[tuple[int, int]]:
