@@ -4,9 +4,9 @@ python -m benchmarks.budget_runs fox.nerf lego_400.nerf --runs runs.json
 python -m benchmarks.budget_runs fox.nerf --constant 0.2 --schedule more --runs runs.json
 
 A workspace needs its stages up to effects. A run that the file holds already is not made again. All runs of a set have
-one size of field and of photos, those that stage train chooses where 1,000 steps draw every pixel about once. Beside
-the field itself a running mean of its weights is measured, over the last tenth of the run (Karras et al. 2024, section
-3.1). benchmarks.prediction reads the file.
+one size of field and of photos, those that stage train chooses where 1,000 steps draw every pixel about once; test
+photos are measured at the size at which they are scored. Beside the field itself a running mean of its weights is
+measured, over the last tenth of the run (Karras et al. 2024, section 3.1). benchmarks.prediction reads the file.
 """
 
 import argparse
@@ -81,7 +81,7 @@ def bench_of(workspace: Path) -> Bench:
     config = config.model_copy(update={"downscale": downscale})
     config = field_of(config).with_sizes(config, scene, rays)
     train = dataset_with_depths(inputs, scene, downscale, PlainDisplay())
-    test = training_dataset(inputs["ingest"], scene, "test", downscale, PlainDisplay())
+    test = training_dataset(inputs["ingest"], scene, "test", None, PlainDisplay())
     shown_over = torch.tensor(field_background(config, scene))
     pixels = sample_evaluation_pixels(test, EVALUATION_PIXELS, shown_over, seed=0)
     return Bench(
