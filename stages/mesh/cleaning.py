@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 # quarter; what only shows past the edge of something else is visible in fewer (docs/experiments/mesh.md).
 MIN_VISIBLE_FRACTION = 0.2
 DILATION_STEPS = 10  # edges from a visible vertex within which faces are kept: creases and gaps close
+FRINGE_STEPS = 3  # edges of the decimated surface: what photos graze is no fringe
 MIN_VISIBLE_AREA = 0.1  # of a component's; an inner cavity has none, the visible side of an object about half
 # Of a component's area, near a sparse point. Of the demo's table 41 % lies within 0.03 of one, 57 % within 0.05; of
 # sheets of sky below it nothing within 0.3 (docs/experiments/mesh.md).
@@ -111,6 +112,26 @@ def _hidden(surface: Surface, visible: np.ndarray, points: np.ndarray, has_alpha
         supported = np.isfinite(tree.query(surface.vertices, distance_upper_bound=radius)[0])
         hidden = ~(supported | visible)[surface.faces].all(1)
     return hidden & ~hidden.all()
+
+
+def cut_unseen(surface: Surface, seen: np.ndarray, min_component: float) -> tuple[Surface, np.ndarray]:
+    """The surface without its fringes, and the old index of each vertex: what hangs behind a wall or past the end of a
+    table where no photo looks.
+
+    A face belongs to a fringe if it lies more than FRINGE_STEPS edges from every vertex that is ``seen`` (n,), and hangs
+    together with an open border by such faces: what photos see all around closes the surface, and stays. Parts that
+    only fringes held together stay if they have ``min_component`` of the largest one's area.
+    """
+    for _ in range(FRINGE_STEPS):
+        seen = _dilated(surface.faces, seen)
+    fringe = _ends_openly(surface, ~seen[surface.faces].any(axis=1))
+    if not fringe.any() or fringe.all():
+        return surface, np.arange(len(surface.vertices))
+    rest, left = keep_faces(surface, ~fringe)
+    label = components(rest)
+    area = np.bincount(label, face_areas(rest))
+    large, of_large = keep_faces(rest, (area >= min_component * area.max())[label])
+    return large, left[of_large]
 
 
 def _ends_openly(surface: Surface, marked: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from stages.hardware.memory import available_bytes, check_memory
 from stages.io.amounts import counted
 from stages.io.field_files import load_field
 from stages.io.files import SMALL_COPY, read_scene, read_tensors, write_png, write_tensors
-from stages.mesh.cleaning import Cleaned, boundary, clean
+from stages.mesh.cleaning import Cleaned, boundary, clean, cut_unseen
 from stages.mesh.face_count import default_faces
 from stages.mesh.files import WRITERS, Z_UP_TO_Y_UP, ColouredMesh
 from stages.mesh.grid_space import (
@@ -127,9 +127,10 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
         raw, visibility, source.points, config.keep, min_views, config.min_component, source.scene.has_alpha
     )
     cropped = _cropped(config, cleaned.surface, source, progress)
-    surface = _decimated(config, cropped, source.space)
+    decimated = _decimated(config, cropped, source.space)
+    surface, best_photos = _seen_part(config, decimated, source, voxel_size, progress)
     ends = boundary(surface, extent, voxel_size, cropped=len(cropped.faces) < len(cleaned.surface.faces))
-    surface, refined, best_photos = _refined(config, surface, source, voxel_size, progress)
+    surface, refined = _refined(config, surface, best_photos, voxel_size, progress)
     if config.close:
         surface, closed = close_holes(surface, config.close)
         ends = "watertight" if is_watertight(surface) else ends
@@ -200,16 +201,26 @@ def _best_photos(
     return find_best_photos(surface, source.scene, source.ingest, source.info, voxels, report)
 
 
-def _refined(
+def _seen_part(
     config: "Config", surface: Surface, source: Source, voxel_size: VoxelSize, progress: Progress
-) -> tuple[Surface, Refined | None, BestPhotos | None]:
-    """The surface moved to where the photos agree, if asked for, what that gained, and the photos that see it: None
-    where neither this nor a texture needs them."""
-    if not config.refine and config.texture_size == 0:
-        return surface, None, None
+) -> tuple[Surface, BestPhotos | None]:
+    """The surface without fringes, where only what is visible is asked for, and the photos that see it: None where
+    nothing needs them."""
+    if config.keep != "visible" and not config.refine and config.texture_size == 0:
+        return surface, None
     best_photos = _best_photos(surface, source, voxel_size, progress, 0.55)
-    if not config.refine:
-        return surface, None, best_photos
+    if config.keep != "visible":
+        return surface, best_photos
+    seen, vertex = cut_unseen(surface, best_photos.seen(), config.min_component)
+    return seen, best_photos.of_part(seen, vertex)
+
+
+def _refined(
+    config: "Config", surface: Surface, best_photos: BestPhotos | None, voxel_size: VoxelSize, progress: Progress
+) -> tuple[Surface, Refined | None]:
+    """The surface moved to where the photos agree, if asked for, and what that gained."""
+    if not config.refine or best_photos is None:
+        return surface, None
 
     def report(done: float) -> None:
         progress.update("refining the surface", 0.6 + 0.05 * done)
@@ -217,10 +228,10 @@ def _refined(
     refined = refine(surface, best_photos, voxel_size.at(surface.vertices), report)
     if refined is None:
         progress.note("mesh.not-refined", "hardly any of the surface is visible in two photos: it is not refined")
-        return surface, None, best_photos
+        return surface, None
     if not refined.kept:
         progress.note("mesh.no-better-refined", "the photos agree no better on the refined surface: it stays as it was")
-    return refined.surface, refined, best_photos
+    return refined.surface, refined
 
 
 def _textured(

@@ -43,6 +43,15 @@ class BestPhotos(NamedTuple):
     quality: np.ndarray
     whole: np.ndarray
 
+    def seen(self) -> np.ndarray:
+        """Which vertices a photo sees, (n,) bool."""
+        return self.quality.max(axis=1, initial=0) > 0
+
+    def of_part(self, part: Surface, vertex: np.ndarray) -> "BestPhotos":
+        """Those of a part of the surface; ``vertex``: the old index of each of its vertices."""
+        kept = (each[vertex] for each in (self.number, self.pixels, self.quality, self.whole))
+        return BestPhotos(self.photos, neighbour_means(part), *kept)
+
     def centres(self) -> np.ndarray:
         """Where the photos were taken, (photos, 3)."""
         return np.array([photo.view.scene_from_camera[:, 3] for photo in self.photos])

@@ -16,6 +16,7 @@ from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages import mesh
 from stages.contract import run_stage
 from stages.io.files import write_json, write_tensors
+from stages.io.photos import write_photos
 from stages.mesh import extraction, preview, resolution, visibility
 from stages.mesh.extraction import vertex_colours
 from stages.mesh.face_count import default_faces
@@ -104,6 +105,7 @@ def run_mesh(tmp_path, progress, monkeypatch):
         inputs = {name: tmp_path / name for name in mesh.STAGE.inputs}
         for path in (*inputs.values(), tmp_path / folder):
             path.mkdir(exist_ok=True)
+        write_photos(inputs["ingest"], [], [], {})
         write_json(inputs["normalise"] / "scene.json", (scene or scene_around()).to_json())
         write_tensors(inputs["normalise"] / "points.safetensors", {"xyz": points})
         info = {"rays": 1000, "effects": learnt or {}, "settings": {"space": {"kind": "box"}}}
@@ -207,7 +209,7 @@ def test_colours_at_a_reference_exposure_say_at_which(run_mesh):
     result, _ = run_mesh(Solid(ball))
     assert "appearance" not in result.facts and "expos" not in result.line
     stop = math.log(2)
-    photos = {"a.jpg": [0.0, 0.1 * stop, 0.2 * stop], "b.jpg": [stop] * 3, "c.jpg": [2 * stop] * 3}
+    photos = {"1.jpg": [0.0, 0.1 * stop, 0.2 * stop], "2.jpg": [stop] * 3, "3.jpg": [2 * stop] * 3}
     result, _ = run_mesh(Solid(ball), "exposed", learnt={"exposure": photos})
     assert result.facts["appearance"] == "reference exposure, +0.90 EV over the least exposed photo"
     assert result.line.endswith("watertight · reference exposure, +0.90 EV over the least exposed photo")
