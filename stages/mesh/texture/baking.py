@@ -27,6 +27,7 @@ from stages.mesh.texture.view_selection import Candidates, Choice
 LEVELLING_STEPS = 6  # over neighbours, of the differences between photos
 FACES_AT_ONCE = 1 << 12
 TEXELS_AT_ONCE = 1 << 22
+GUTTER_ROWS, GUTTER_REACH = 512, 128
 
 
 def bake(
@@ -66,7 +67,9 @@ def bake(
         picture[some] = np.rint(light[some].astype(np.float32) * 255).clip(0, 255)
     del light
     shape = (atlas.height, atlas.width)
-    return fill_gutters(picture.reshape(*shape, 3), covered.reshape(shape))
+    picture = picture.reshape(*shape, 3)
+    fill_gutters(picture, covered.reshape(shape))
+    return picture
 
 
 def _of_photo(
@@ -121,17 +124,23 @@ def _levelling(candidates: Candidates, photo: int, colour: np.ndarray, means: cs
     return np.divide(difference, known, out=np.zeros_like(difference), where=known > 0)
 
 
-def fill_gutters(picture: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """Give every texel outside of the charts the colour of the nearest one inside, so that filtering finds no black."""
-    if covered.all() or not covered.any():
-        return picture
-    _, nearest = cv2.distanceTransformWithLabels(
-        (~covered).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    # Labels count the covered texels, in an order that OpenCV does not promise: they are read at these texels.
-    label = np.asarray(nearest, np.int32).reshape(-1)
-    flat, inside, gaps = picture.reshape(-1, 3), np.flatnonzero(covered), np.flatnonzero(~covered)
-    source = np.empty(int(label.max()) + 1, np.int32)
-    source[label[inside]] = inside
-    flat[gaps] = flat[source[label[gaps]]]
-    return picture
+def fill_gutters(picture: np.ndarray, covered: np.ndarray) -> None:
+    """Give every texel outside of the charts the colour of the nearest one inside, so that filtering finds no black. In
+    bands, to save memory: charts more than GUTTER_REACH rows off a band do not count, unless there is none nearer."""
+    for start in range(0, len(picture), GUTTER_ROWS):
+        low, end = max(0, start - GUTTER_REACH), start + GUTTER_ROWS
+        known = covered[low : end + GUTTER_REACH].copy()
+        gaps = (start - low) * covered.shape[1] + np.flatnonzero(~known[start - low : end - low])
+        if not known.any():
+            known[: start - low] = True  # filled by the band before
+        if not len(gaps) or not known.any():
+            continue
+        _, nearest = cv2.distanceTransformWithLabels(
+            (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        # Labels count the known texels, in an order that OpenCV does not promise: they are read at these texels.
+        label, inside = np.asarray(nearest, np.int32).reshape(-1), np.flatnonzero(known)
+        source = np.empty(int(label.max()) + 1, np.int32)
+        source[label[inside]] = inside
+        flat = picture[low : end + GUTTER_REACH].reshape(-1, 3)
+        flat[gaps] = flat[source[label[gaps]]]

@@ -19,6 +19,7 @@ from stages.mesh.photos.best_photos import find_best_photos
 from stages.mesh.photos.photo import sampled_picture
 from stages.mesh.rasteriser import barycentric, covered_pixels
 from stages.mesh.surface import Surface, vertex_normals
+from stages.mesh.texture import baking
 from stages.mesh.texture.atlas import make_atlas
 from stages.mesh.texture.baking import fill_gutters
 from stages.mesh.texture.charts import cut_into_charts
@@ -253,13 +254,20 @@ def test_a_surface_that_no_photo_sees_has_no_texture(shoot, tmp_path):
     assert found is None
 
 
-def test_gutters_repeat_the_nearest_texel():
+def test_gutters_repeat_the_nearest_texel(monkeypatch):
     picture, covered = np.zeros((8, 9, 3), np.uint8), np.zeros((8, 9), bool)
     covered[2, 1], covered[6, 7] = True, True
     picture[2, 1], picture[6, 7] = 50, 200
-    filled = fill_gutters(picture, covered)
-    assert filled[0, 0].tolist() == [50] * 3 and filled[7, 8].tolist() == [200] * 3 and filled[2, 1, 0] == 50
-    assert set(np.unique(filled)) == {50, 200}
+    whole, banded = picture.copy(), picture.copy()
+    fill_gutters(whole, covered)
+    assert whole[0, 0].tolist() == [50] * 3 and whole[7, 8].tolist() == [200] * 3 and whole[2, 1, 0] == 50
+    assert set(np.unique(whole)) == {50, 200}
+    monkeypatch.setattr(baking, "GUTTER_ROWS", 3)
+    fill_gutters(banded, covered)
+    assert np.array_equal(banded, whole), "the same in bands, whose reach covers the picture"
+    monkeypatch.setattr(baking, "GUTTER_REACH", 1)
+    fill_gutters(picture, covered)
+    assert set(np.unique(picture)) == {50, 200}, "nothing stays black"
 
 
 def test_files_hold_the_texture_the_right_way_up(shoot, baked, tmp_path):
