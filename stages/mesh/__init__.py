@@ -2,7 +2,7 @@
 
 Density on a grid over the region of interest → marching cubes at the iso-level where the photos' rays stop → only what
 the photos see → decimation → refinement: moved to where the photos agree → holes closed, if asked for → a texture from
-the photos → GLB, PLY, OBJ, STL, 3MF.
+the photos → GLB, PLY, OBJ, STL, 3MF, USDZ.
 A surface that leaves the region of interest ends there, open: closing it would invent geometry.
 """
 
@@ -26,7 +26,7 @@ REFINEMENT_SECONDS, REFINEMENT_SECONDS_PER_PHOTO = 6.0, 0.2
 MEASURED_FACES = 100_000  # which REFINEMENT_SECONDS are for
 MIN_SHARE_OF_SHAPE = 0.3  # of a time limit, that refinement and texture leave
 
-Format = Literal["glb", "ply", "obj", "stl", "3mf"]
+Format = Literal["glb", "ply", "obj", "stl", "3mf", "usdz"]
 Keep = Literal["visible", "largest", "all"]
 Box = tuple[float, float, float, float, float, float]
 
@@ -134,6 +134,10 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     of this machine; and the frame. The number of faces follows from the surface, once that is there."""
     from stages.mesh.resolution import choose_resolution
 
+    if "usdz" in config.formats:
+        from stages.mesh.files.usdz import check_installed
+
+        check_installed()
     metres = metres_per_unit(inputs["scale"])
     if config.frame == "metric" and metres is None:
         raise StageError(
@@ -168,7 +172,7 @@ STAGE = Stage(
     inputs=("ingest", "normalise", "scale", "train"),
     version=23,
     exit_code=17,
-    published=("mesh.glb", "mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "mesh.stl", "mesh.3mf"),
+    published=("mesh.glb", "mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "mesh.stl", "mesh.3mf", "mesh.usdz"),
     config=Config,
     not_hashed=("seconds",),  # it decides the resolution, and that enters the key
     plan=plan,

@@ -118,9 +118,9 @@ def cut_unseen(surface: Surface, seen: np.ndarray, min_component: float) -> tupl
     """The surface without its fringes, and the old index of each vertex: what hangs behind a wall or past the end of a
     table where no photo looks.
 
-    A face belongs to a fringe if it lies more than FRINGE_STEPS edges from every vertex that is ``seen`` (n,), and hangs
-    together with an open border by such faces: what photos see all around closes the surface, and stays. Parts that
-    only fringes held together stay if they have ``min_component`` of the largest one's area.
+    A face belongs to a fringe if it lies more than FRINGE_STEPS edges from every vertex that is ``seen`` (n,), and
+    hangs together with an open border by such faces: what photos see all around closes the surface, and stays. Parts
+    that only fringes held together stay if they have ``min_component`` of the largest one's area.
     """
     for _ in range(FRINGE_STEPS):
         seen = _dilated(surface.faces, seen)

@@ -1,5 +1,6 @@
 """Mesh files: read back by another library, upright, precise far from the origin, equal bytes."""
 
+import io
 import json
 import struct
 import zipfile
@@ -9,8 +10,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
+from pxr import Usd, UsdGeom, UsdValidation
 from trimesh.visual import ColorVisuals
 
+from nerf.rendering.srgb_arrays import linear_light
 from stages.mesh import Format
 from stages.mesh.files import (
     WRITERS,
@@ -21,12 +25,17 @@ from stages.mesh.files import (
     ply_bytes,
     stl_bytes,
     threemf_bytes,
+    usdz,
+    usdz_file,
 )
+from stages.mesh.texture.atlas import Atlas, Texture
+from tests.refusals import refused
 
 VERTICES = np.array([[0.1, 0, 0], [1, 0.2, 0], [0, 1, 0.3], [0.4, 0, 1]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
 COLOURS = np.array([[0, 10, 255], [128, 1, 30], [200, 100, 50], [255, 255, 255]], np.uint8)
 NORMALS = VERTICES / np.linalg.norm(VERTICES, axis=1, keepdims=True)
+UV = np.array([[1.0, 1], [7, 1], [7, 3], [1, 3]])
 FAR = np.array([5e6, -1e6, 200.0])
 QUARTER_TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
@@ -108,6 +117,39 @@ def test_shapes_for_printing_are_read_back(tmp_path, mesh):
     faces = [[int(t.attrib[f"v{i}"]) for i in (1, 2, 3)] for t in model.iter() if t.tag.endswith("}triangle")]
     np.testing.assert_allclose(vertices, mesh.vertices - centre, atol=1e-6)
     assert faces == FACES.tolist()
+
+
+@pytest.mark.parametrize("textured", [True, False])
+def test_usdz_is_read_back_and_valid(tmp_path, mesh, textured):
+    atlas = Atlas(UV, FACES[:, ::-1].copy(), np.array([3, 2, 1, 0]), 8, 4, 1.0)
+    picture = np.random.default_rng(0).integers(0, 256, (4, 8, 3), np.uint8)
+    mesh = mesh._replace(texture=Texture(atlas, picture) if textured else None)
+    upright = Z_UP_TO_Y_UP @ QUARTER_TURN
+    content = usdz_file(mesh, upright)
+    assert content == usdz_file(mesh, upright)
+    (tmp_path / "mesh.usdz").write_bytes(content)
+    scene = Usd.Stage.Open(str(tmp_path / "mesh.usdz"))
+    found = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators()).Validate(scene)
+    assert [each.GetMessage() for each in found] == []
+    loaded = UsdGeom.Mesh(scene.GetPrimAtPath("/scene/mesh"))
+    matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(loaded.GetPrim()))
+    placed = np.array(loaded.GetPointsAttr().Get()) @ matrix[:3, :3] + matrix[3, :3]
+    vertex = atlas.vertex if textured else np.arange(4)
+    np.testing.assert_allclose(placed, mesh.vertices[vertex] @ upright.T, rtol=0, atol=tolerance(mesh))
+    faces = np.array(loaded.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    np.testing.assert_array_equal(faces, atlas.corner if textured else FACES)
+    name, values = ("st", mesh.texture.coordinates()) if textured else ("displayColor", linear_light(COLOURS / 255))
+    np.testing.assert_allclose(UsdGeom.PrimvarsAPI(loaded).GetPrimvar(name).Get(), values, atol=1e-6)
+    with zipfile.ZipFile(tmp_path / "mesh.usdz") as archive:
+        assert archive.namelist() == ["mesh.usdc", "mesh.png"][: 1 + textured]
+        if textured:
+            assert np.array_equal(np.asarray(Image.open(io.BytesIO(archive.read("mesh.png")))), picture)
+
+
+def test_usdz_needs_its_extra(monkeypatch):
+    monkeypatch.setattr(usdz, "find_spec", lambda _: None)
+    with refused("mesh.usd-not-installed"):
+        usdz.check_installed()
 
 
 def test_up_becomes_plus_y():

@@ -1,15 +1,15 @@
 """Mesh files; equal meshes give equal bytes.
 
 A new format is a function and its line in WRITERS. GLB and OBJ show the texture where there is one; PLY has a colour
-per vertex; STL and 3MF, for printing, hold the shape. GLB and STL are written by trimesh, and OBJ without a texture.
-PLY is not, because trimesh stores its coordinates as float32, nor is OBJ with a texture, which it would take apart into
-charts. Coordinates stay in the frame they are given in. Two consequences:
+per vertex; STL and 3MF, for printing, hold the shape; USDZ is for phones. GLB and STL are written by trimesh, and OBJ
+without a texture. PLY is not, because trimesh stores its coordinates as float32, nor is OBJ with a texture, which it
+would take apart into charts. Coordinates stay in the frame they are given in. Two consequences:
 
-* **GLB** is +y up by definition: the mesh's node turns it upright and nothing else moves.
+* **GLB** is +y up by definition, and so is USDZ here: the mesh's node turns it upright and nothing else moves.
 * An sfm frame may lie a million units from its origin (georeferenced cameras), where float32 has steps of 6 cm.
-  A mesh that lies further from the origin than 16 times its size is therefore stored around its own centre in GLB, with
-  the offset in its node, in STL and 3MF, without it, and with double coordinates in PLY. OBJ gets as many decimals as
-  1e-7 of the size asks for.
+  A mesh that lies further from the origin than 16 times its size is therefore stored around its own centre in GLB and
+  USDZ, with the offset in its node, in STL and 3MF, without it, and with double coordinates in PLY. OBJ gets as many
+  decimals as 1e-7 of the size asks for.
 
 glTF wants linear colours at vertices and has no word for radiance: they are made linear and the material is unlit
 (KHR_materials_unlit; programs without it shade the mesh instead).
@@ -30,6 +30,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from nerf.rendering.srgb_arrays import linear_light
+from stages.mesh.files.usdz import Drawn, usdz_bytes
 from stages.mesh.texture.atlas import Texture
 
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -140,12 +141,11 @@ def threemf_bytes(mesh: ColouredMesh) -> bytes:
 def glb_bytes(mesh: ColouredMesh, upright_from_mesh: np.ndarray) -> bytes:
     """Binary glTF 2.0 with the texture in it, or colours of vertices; ``upright_from_mesh`` (3, 3) is the rotation to
     +y up. A vertex on the border of charts is there once for each."""
-    offset = offset_for_float32(mesh.vertices)
+    offset, (vertex, faces) = offset_for_float32(mesh.vertices), _split_at_charts(mesh)
     if mesh.texture is None:
-        vertex, faces = np.arange(len(mesh.vertices)), mesh.faces
         visual, colours = None, _linear_rgba(mesh.colours)
     else:
-        vertex, faces, colours = mesh.texture.atlas.vertex, mesh.texture.atlas.corner, None
+        colours = None
         with Image.open(_png(mesh.texture.picture)) as picture:
             picture.load()
             material = PBRMaterial(baseColorTexture=picture)
@@ -158,11 +158,38 @@ def glb_bytes(mesh: ColouredMesh, upright_from_mesh: np.ndarray) -> bytes:
         visual=visual,
         process=False,
     )
+    scene = trimesh.Scene()
+    scene.add_geometry(centred, node_name="mesh", geom_name="mesh", transform=_upright(upright_from_mesh, offset))
+    return export_glb(scene, include_normals=True, tree_postprocessor=_make_unlit)
+
+
+def usdz_file(mesh: ColouredMesh, upright_from_mesh: np.ndarray) -> bytes:
+    """USDZ with the texture in it, or colours of vertices; as :func:`glb_bytes`."""
+    offset, (vertex, faces) = offset_for_float32(mesh.vertices), _split_at_charts(mesh)
+    texture = mesh.texture
+    drawn = Drawn(
+        points=mesh.vertices[vertex] - offset,
+        normals=mesh.normals[vertex],
+        faces=faces,
+        uv=None if texture is None else texture.coordinates(),
+        colours=linear_light(mesh.colours[vertex] / 255),
+        picture=b"" if texture is None else _png(texture.picture).getvalue(),
+    )
+    return usdz_bytes(drawn, _upright(upright_from_mesh, offset))
+
+
+def _split_at_charts(mesh: ColouredMesh) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices, those on the border of charts once for each, as indices (n,), and the faces of these (m, 3)."""
+    if mesh.texture is None:
+        return np.arange(len(mesh.vertices)), mesh.faces
+    return mesh.texture.atlas.vertex, mesh.texture.atlas.corner
+
+
+def _upright(upright_from_mesh: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """The matrix of the node of vertices less ``offset``."""
     upright = np.eye(4)
     upright[:3, :3], upright[:3, 3] = upright_from_mesh, upright_from_mesh @ offset
-    scene = trimesh.Scene()
-    scene.add_geometry(centred, node_name="mesh", geom_name="mesh", transform=upright)
-    return export_glb(scene, include_normals=True, tree_postprocessor=_make_unlit)
+    return upright
 
 
 def _png(picture: np.ndarray) -> io.BytesIO:
@@ -192,6 +219,7 @@ WRITERS: dict[str, Callable[[ColouredMesh, np.ndarray], dict[str, bytes]]] = {
     "obj": lambda mesh, _: obj_files(mesh),
     "stl": lambda mesh, _: {"mesh.stl": stl_bytes(mesh)},
     "3mf": lambda mesh, _: {"mesh.3mf": threemf_bytes(mesh)},
+    "usdz": lambda mesh, upright: {"mesh.usdz": usdz_file(mesh, upright)},
 }
 """By format: the mesh and its rotation to +y up, to files by name."""
 
