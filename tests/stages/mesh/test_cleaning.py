@@ -5,7 +5,7 @@ import pytest
 
 from nerf.geometry.space_maps import Box
 from stages.contract import StageError
-from stages.mesh.cleaning import DILATION_STEPS, MIN_POINTS, SUPPORT_RADIUS, boundary, clean
+from stages.mesh.cleaning import DILATION_STEPS, FRINGE_STEPS, MIN_POINTS, SUPPORT_RADIUS, boundary, clean, cut_unseen
 from stages.mesh.grid_space import VoxelSize
 from stages.mesh.surface import Surface
 from stages.mesh.visibility import Visibility
@@ -182,3 +182,36 @@ def sheet(low, high):
 )
 def test_the_end_of_a_surface_is_named(surface, words):
     assert boundary(surface, (CUBE, CUBE), VoxelSize(Box(), np.full(3, 0.02))) == words
+
+
+def test_fringes_that_no_photo_sees_are_cut():
+    strip = Surface(*long_strip())
+    seen = (strip.vertices[:, 0] >= 40) & (strip.vertices[:, 0] <= 60)
+    part, vertex = cut_unseen(strip, seen, 0.0)
+    ends = 40 - FRINGE_STEPS - 1, 60 + FRINGE_STEPS + 1
+    assert (part.vertices[:, 0].min(), part.vertices[:, 0].max()) == ends, "a face with one near vertex stays"
+    np.testing.assert_array_equal(part.vertices, strip.vertices[vertex])
+    for everything in (np.ones(len(seen), bool), np.zeros(len(seen), bool)):
+        assert cut_unseen(strip, everything, 0.0)[0] is strip, "all seen, or none"
+
+
+def test_what_photos_see_all_around_stays():
+    """A sheet with an unseen patch: in its middle it stays, at its border it goes."""
+    line = np.arange(31.0)
+    x, y = (each.reshape(-1) for each in np.meshgrid(line, line, indexing="ij"))
+    corner = (31 * np.arange(30)[:, None] + np.arange(30)).reshape(-1, 1)
+    sheet = Surface(
+        np.stack([x, y, 0 * x], axis=1),
+        np.concatenate([corner + np.array(turn) for turn in ([0, 31, 1], [1, 31, 32])]).astype(np.int32),
+    )
+    for middle, left in ((15.0, 1800), (0.0, None)):
+        seen = (np.abs(x - middle) > 8) | (np.abs(y - 15) > 8)
+        count = len(cut_unseen(sheet, seen, 0.01)[0].faces)
+        assert count == left if left else 1500 < count < 1800
+
+
+def test_specks_that_fringes_held_go_with_them():
+    strip = Surface(*long_strip())
+    seen = (strip.vertices[:, 0] < 40) | (strip.vertices[:, 0] == 99)
+    assert cut_unseen(strip, seen, 0.3)[0].vertices[:, 0].max() == 40 + FRINGE_STEPS
+    assert cut_unseen(strip, seen, 0.01)[0].vertices[:, 0].max() == 100
