@@ -1,8 +1,8 @@
 """Stage mesh: the field's density becomes a triangle mesh that looks like the photos.
 
 Density on a grid over the region of interest → marching cubes at the iso-level where the photos' rays stop → only what
-the photos see → decimation → refinement: moved to where the photos agree → holes closed, if asked for → a texture from
-the photos → GLB, PLY, OBJ, STL, 3MF, USDZ.
+the photos see → decimation → fringes cut off → refinement: moved to where the photos agree → holes closed, if asked for
+→ a texture from the photos → GLB, PLY, OBJ, STL, 3MF, USDZ.
 A surface that leaves the region of interest ends there, open: closing it would invent geometry.
 """
 
@@ -170,7 +170,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 STAGE = Stage(
     name="mesh",
     inputs=("ingest", "normalise", "scale", "train"),
-    version=23,
+    version=24,
     exit_code=17,
     published=("mesh.glb", "mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "mesh.stl", "mesh.3mf", "mesh.usdz"),
     config=Config,

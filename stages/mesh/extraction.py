@@ -80,14 +80,15 @@ class Source(NamedTuple):
 
 
 class Extracted(NamedTuple):
-    """``mesh`` in the scene frame with the number of its ``components``, how it came about, what was ``refined`` and
-    ``closed``, ``boundary``: where it ends, and the texture with what is known of it. ``voxel`` is in scene units, the
-    median over the vertices."""
+    """``mesh`` in the scene frame with the number of its ``components``, how it came about, how many faces its
+    ``fringes`` had (:func:`stages.mesh.cleaning.cut_unseen`), what was ``refined`` and ``closed``, ``boundary``: where
+    it ends, and the texture with what is known of it. ``voxel`` is in scene units, the median over the vertices."""
 
     mesh: ColouredMesh
     components: int
     iso_level: IsoLevel
     cleaned: Cleaned
+    fringes: int
     refined: Refined | None
     closed: Closed
     boundary: str
@@ -128,9 +129,9 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     )
     cropped = _cropped(config, cleaned.surface, source, progress)
     decimated = _decimated(config, cropped, source.space)
-    surface, best_photos = _seen_part(config, decimated, source, voxel_size, progress)
-    ends = boundary(surface, extent, voxel_size, cropped=len(cropped.faces) < len(cleaned.surface.faces))
-    surface, refined = _refined(config, surface, best_photos, voxel_size, progress)
+    seen, best_photos = _seen_part(config, decimated, source, voxel_size, progress)
+    ends = boundary(seen, extent, voxel_size, cropped=len(cropped.faces) < len(cleaned.surface.faces))
+    surface, refined = _refined(config, seen, best_photos, voxel_size, progress)
     if config.close:
         surface, closed = close_holes(surface, config.close)
         ends = "watertight" if is_watertight(surface) else ends
@@ -152,7 +153,8 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     mesh = ColouredMesh(*surface, vertex_normals(surface), colours, textured and textured.texture)
     voxel = float(np.median(voxel_size.at(surface.vertices).along))
     parts = int(components(surface).max()) + 1
-    return Extracted(mesh, parts, iso_level, cleaned, refined, closed, ends, voxel, textured)
+    fringes = len(decimated.faces) - len(seen.faces)
+    return Extracted(mesh, parts, iso_level, cleaned, fringes, refined, closed, ends, voxel, textured)
 
 
 def _decimated(config: "Config", surface: Surface, space: SpaceMap) -> Surface:
@@ -368,6 +370,7 @@ def _facts(config: "Config", extracted: Extracted, source: Source) -> dict[str, 
             "components_dropped": cleaned.dropped,
             "faces_outside_photos": cleaned.outside,
             "faces_hidden": cleaned.hidden,
+            "faces_in_fringes": extracted.fringes,
             "holes_closed": extracted.closed.holes,
             "holes_left": extracted.closed.left,
             "invented_area_share": extracted.closed.area_share,

@@ -58,6 +58,7 @@ MESH_FIGURES = {
     "components_dropped": ("components removed", ""),
     "faces_outside_photos": ("faces removed outside of all photos", ""),
     "faces_hidden": ("faces removed that no photo sees", ""),
+    "faces_in_fringes": ("faces removed at open ends, after decimation", ""),
     "holes_closed": ("holes closed", ""),
     "holes_left": ("holes left open", ""),
     "invented_area_share": ("area that closes holes", "%"),
