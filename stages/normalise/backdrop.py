@@ -21,8 +21,8 @@ from stages.io.photos import Box, Photo, spread
 from stages.io.pixels import box_of, load_pixels, loaders
 from stages.normalise import FEW_PHOTOS
 
-LONG_SIDE = 200  # pixels of a photo made small, in which noise is averaged and a thin part still has a pixel
-BORDER = 2  # of them, at each edge
+LONG_SIDE = 200  # pixels of a photo made small, in which a thin part still has one
+BORDER = 2  # of these pixels, at each edge
 FEW = FEW_PHOTOS  # evenly spread: they can rule a backdrop out without a look at the others
 # Of 255, in each channel. Deviations spread evenly over this have a root mean square of 0.018 of the range of colours,
 # twice the MIN_EFFECT of nerf/effects/statistics/statistic.py: with more, leaving the backdrop out would be seen.
@@ -75,10 +75,11 @@ def backdrop_or_none(backdrop: Backdrop, found: Normalisation, progress: Progres
 
 
 def _small(ingest: Path, photo: Photo) -> np.ndarray:
-    """A photo (h, w, 3) uint8, LONG_SIDE pixels along its longer side or, if that is less, its own size."""
+    """A photo (h, w, 3) uint8, LONG_SIDE pixels along its longer side or, if that is less, its own size; a mean of 3 × 3
+    of them, so that what noise does to one does not count, and a pixel that is half an object's does."""
     shrink = max(1.0, max(photo.width, photo.height) / LONG_SIDE)
     width, height = round(photo.width / shrink), round(photo.height / shrink)
-    return load_pixels(ingest / photo.file, width, height, quick=True)[..., :3]
+    return cv2.blur(load_pixels(ingest / photo.file, width, height, quick=True)[..., :3], (3, 3))
 
 
 def _border(pixels: np.ndarray) -> np.ndarray:
@@ -93,8 +94,5 @@ def _has(colour: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 def _look(pixels: np.ndarray, colour: np.ndarray) -> tuple[float, Box | None]:
-    """How much of a photo's border has the colour, and what holds all that has another one: with a pixel around it,
-    where an edge may be mixed with the backdrop."""
-    other = (~_has(colour, pixels)).astype(np.uint8)
-    box = box_of(cv2.dilate(other, np.ones((3, 3), np.uint8)) > 0)
-    return float(_has(colour, _border(pixels)).mean()), box
+    """How much of a photo's border has the colour, and what holds all that has another one."""
+    return float(_has(colour, _border(pixels)).mean()), box_of(~_has(colour, pixels))
