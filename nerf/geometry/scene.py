@@ -76,9 +76,9 @@ class Scene:
 
     ``bounded``: all that the photos show lies inside the region of interest; otherwise space beyond it is contracted
     (nerf/geometry/space_maps/contraction.py). ``has_alpha``: the photos' alpha, or masks in its place, says what is
-    background. ``backdrop``: without alpha, the one colour (sRGB in [0, 1]) that the photos show wherever nothing of the
-    scene is; None: they show other things. ``capture_type``: cameras around an object, cameras that look outward or through a room, or all facing
-    one way.
+    background. ``backdrop``: without alpha, the one colour (sRGB in [0, 1]) that the photos show wherever nothing of
+    the scene is; None: they show other things. ``capture_type``: cameras around an object, cameras that look outward or
+    through a room, or all facing one way.
     """
 
     cameras: tuple[Camera, ...]

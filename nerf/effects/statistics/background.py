@@ -27,8 +27,8 @@ def background_statistic(
     beyond = np.abs(position).max(axis=1) > REGION_HALF_SIZE
     share = float(np.average(beyond, weights=seen))
     words = (
-        f"no alpha or plain backdrop rules it out: {share:.1%} of the observations are of points beyond the region of interest, and "
-        f"{untracked:.0%} of the photos' area has no point nearby"
+        f"no alpha or plain backdrop rules it out: {share:.1%} of the observations are of points beyond the region of "
+        f"interest, and {untracked:.0%} of the photos' area has no point nearby"
     )
     return Statistic(share, "share", NEVER, NEVER, True, words)
 
