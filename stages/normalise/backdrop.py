@@ -75,8 +75,8 @@ def backdrop_or_none(backdrop: Backdrop, found: Normalisation, progress: Progres
 
 
 def _small(ingest: Path, photo: Photo) -> np.ndarray:
-    """A photo (h, w, 3) uint8, LONG_SIDE pixels along its longer side or, if that is less, its own size; means of 3 × 3 of
-    them, so that what noise does to one does not count, and a pixel that is partly an object's does."""
+    """A photo (h, w, 3) uint8, LONG_SIDE pixels along its longer side or, if that is less, its own size; means of 3 × 3
+    of them: noise in one does not count, a part of an object does."""
     shrink = max(1.0, max(photo.width, photo.height) / LONG_SIDE)
     width, height = round(photo.width / shrink), round(photo.height / shrink)
     return cv2.blur(load_pixels(ingest / photo.file, width, height, quick=True)[..., :3], (3, 3))
