@@ -9,8 +9,6 @@ from stages.contract import Auto, Inputs, Progress, Stage, StageConfig, StageRes
 
 MASK_SHARE = 0.1  # of the time that its photo takes to decode: a mask is looked at, and its outline carves the region
 
-FEW_PHOTOS = 8  # that are decoded, and tell that nothing plain lies behind
-
 
 class Config(StageConfig):
     """The region of interest and the test photos."""
@@ -39,11 +37,9 @@ class Config(StageConfig):
 
 
 def expected_seconds(config: Config, workload: Workload) -> float:
-    """However many photos there are; masks may all be looked at, and a few photos for a plain backdrop."""
-    photos = workload.photos
-    masked = 0 if config.masks == "ignore" else MASK_SHARE * photos.masked
-    looked_at = masked if photos.masked else min(photos.number, FEW_PHOTOS)
-    return 0.3 + reading_seconds(looked_at * photos.megapixels, workload.cores)
+    """However many photos there are; masks may all be looked at."""
+    masked = 0 if config.masks == "ignore" else workload.photos.masked
+    return 0.3 + MASK_SHARE * reading_seconds(masked * workload.photos.megapixels, workload.cores)
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:

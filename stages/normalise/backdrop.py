@@ -19,11 +19,10 @@ from stages.contract import Progress
 from stages.io.amounts import rgb
 from stages.io.photos import Box, Photo, spread
 from stages.io.pixels import box_of, load_pixels, loaders
-from stages.normalise import FEW_PHOTOS
 
 LONG_SIDE = 200  # pixels of a photo made small, in which a thin part still has one
 BORDER = 2  # of these pixels, at each edge
-FEW = FEW_PHOTOS  # evenly spread: they can rule a backdrop out without a look at the others
+FEW = 8  # photos, evenly spread: they can rule a backdrop out without a look at the others
 # Of 255, in each channel. Deviations spread evenly over this have a root mean square of 0.018 of the range of colours,
 # twice the MIN_EFFECT of nerf/effects/statistics/statistic.py: with more, leaving the backdrop out would be seen.
 TOLERANCE = 8
