@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 Split = Literal["train", "validation", "test"]
 """Validation photos are set aside from the training photos while a run is made that asks for them; no file has any."""
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,9 @@ class Scene:
 
     ``bounded``: all that the photos show lies inside the region of interest; otherwise space beyond it is contracted
     (nerf/geometry/space_maps/contraction.py). ``has_alpha``: the photos' alpha, or masks in its place, says what is
-    background. ``capture_type``: cameras around an object, cameras that look outward or through a room, or all facing
-    one way.
+    background. ``backdrop``: without alpha, the one colour (sRGB in [0, 1]) that the photos show wherever nothing of
+    the scene is; None: they show other things. ``capture_type``: cameras around an object, cameras that look outward or
+    through a room, or all facing one way.
     """
 
     cameras: tuple[Camera, ...]
@@ -87,6 +88,7 @@ class Scene:
     has_alpha: bool
     capture_type: Literal["object-centric", "inside-out", "forward-facing"]
     up_known: bool
+    backdrop: tuple[float, float, float] | None = None
 
     def of_split(self, split: Split) -> tuple[View, ...]:
         """The views of one split, in order of name."""
@@ -112,6 +114,7 @@ class Scene:
             "has_alpha": self.has_alpha,
             "capture_type": self.capture_type,
             "up_known": self.up_known,
+            "backdrop": self.backdrop,
         }
 
     @classmethod
@@ -126,4 +129,6 @@ class Scene:
         )
         s = value.pop("scene_from_sfm")
         similarity = Similarity(s["scale"], np.array(s["rotation"], float), np.array(s["translation"], float))
-        return cls(cameras=cameras, views=views, scene_from_sfm=similarity, **value)
+        red_green_blue = value.pop("backdrop")
+        backdrop = None if red_green_blue is None else tuple(red_green_blue)
+        return cls(cameras=cameras, views=views, scene_from_sfm=similarity, backdrop=backdrop, **value)

@@ -144,7 +144,7 @@ def fits_poses(off: Decisions, on: Decisions) -> bool:
 def expected_seconds(scene: Scene, steps: int) -> tuple[float, float]:
     """What a pilot of all seeds takes here: its trainings, by a few steps of a fresh field, and what goes on beside
     them; and what such a pilot takes that fits poses, too."""
-    decisions = Decisions({"view_dependence": {}} | ({} if scene.has_alpha else {"background": {}}))
+    decisions = Decisions({"view_dependence": {}} | ({} if scene.bounded else {"background": {}}))
 
     def step_on(device: str) -> float:
         return seconds_per_step(_config(decisions, scene, steps, device), scene, decisions, device)
@@ -228,12 +228,12 @@ def _config(decisions: Decisions, scene: Scene, steps: int, device: str) -> Conf
 
 def _score(trained: _Trained, scene: Scene, photo: _Photo, poses: bool, seed: int) -> float:
     """PSNR (dB) on the right half of a photo whose exposure (and pose) is fitted on its left half."""
-    black, effects = torch.zeros(3), photo_effects(trained.learnt, scene, photo.view)
+    behind, effects = torch.tensor(scene.backdrop or BLACK), photo_effects(trained.learnt, scene, photo.view)
     shown = AppearanceModel(trained.field, effects)
-    picture = render_image(shown, photo.rays, black)
+    picture = render_image(shown, photo.rays, behind)
     if poses:
-        rays = from_fitted_pose(trained.field, photo.rays, picture, black, photo.colours, photo.used, effects, seed)
-        picture = render_image(shown, rays, black)
-    _, fitted = right_half_psnr(picture, black, photo.colours, photo.used)
+        rays = from_fitted_pose(trained.field, photo.rays, picture, behind, photo.colours, photo.used, effects, seed)
+        picture = render_image(shown, rays, behind)
+    _, fitted = right_half_psnr(picture, behind, photo.colours, photo.used)
     assert fitted is not None, "pilot_scene takes no photo that has too few pixels"
     return fitted

@@ -24,6 +24,7 @@ from nerf.effects.statistics.warnings import (
 )
 from stages.contract import Progress
 from stages.effects.track_colours import sample_photos
+from stages.io.amounts import rgb
 from stages.io.photos import read_photos
 from stages.sfm.colmap.cameras import project
 
@@ -40,7 +41,7 @@ class Places(NamedTuple):
     their size, how uncertain poses are said to be, and their number among the frames of a video."""
 
     views: int
-    has_alpha: bool
+    beyond_is_nothing: str | None  # why, where the photos tell that nothing lies beyond the region
     xyz: np.ndarray  # (points, 3)
     view: np.ndarray
     point: np.ndarray
@@ -95,7 +96,7 @@ def observed_places(
     usual = REFERENCE_PX / size.max(axis=1)
     return Places(
         views=len(views),
-        has_alpha=scene.has_alpha,
+        beyond_is_nothing=_why_nothing_lies_beyond(scene),
         xyz=points["xyz"].astype(float),
         view=view,
         point=point,
@@ -105,6 +106,12 @@ def observed_places(
         uncertainty_px=stated * usual,
         frame=np.array(scene.indices_of("train")) if _is_video(ingest, [one.file for one in views]) else None,
     )
+
+
+def _why_nothing_lies_beyond(scene: "Scene") -> str | None:
+    if scene.backdrop is not None:
+        return f"the photos show a plain backdrop, {rgb(scene.backdrop)}"
+    return "the photos' alpha separates the background" if scene.has_alpha else None
 
 
 def classify_exposure(seen: Observations) -> Statistic:
@@ -129,7 +136,7 @@ def measured_vignetting(seen: Observations) -> np.ndarray:
 def classify_background(places: Places) -> Statistic:
     """What lies beyond the region, and where no tracks are."""
     untracked = untracked_share(places.xy / places.size[places.view], places.view, places.views)
-    return background_statistic(places.xyz, places.point, places.has_alpha, untracked)
+    return background_statistic(places.xyz, places.point, places.beyond_is_nothing, untracked)
 
 
 def classify_poses(places: Places) -> Statistic:

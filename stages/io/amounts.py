@@ -1,6 +1,7 @@
 """Amounts in words: counts, times, bytes."""
 
 import math
+from collections.abc import Sequence
 
 GB = 2**30
 
@@ -16,6 +17,11 @@ def short_count(count: float) -> str:
 def counted(count: int, one: str = "photo", many: str | None = None) -> str:
     """``1 photo``, ``2 photos``: so many things, each called ``one``, and ``many`` where that takes more than an s."""
     return f"{count:,} {one if count == 1 else many or f'{one}s'}"
+
+
+def rgb(colour: Sequence[float]) -> str:
+    """``rgb(255, 255, 255)``: a colour of numbers from 0 to 1, as style sheets write it."""
+    return f"rgb({', '.join(f'{255 * value:.0f}' for value in colour)})"
 
 
 def duration(seconds: float) -> str:

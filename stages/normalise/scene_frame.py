@@ -21,6 +21,7 @@ from stages.io.photos import Box, Photo, read_photos
 from stages.io.sparse_model import SparseModel
 from stages.io.transforms_export import transforms
 from stages.normalise.alpha import Alpha, alpha_or_none, find_alpha
+from stages.normalise.backdrop import backdrop_or_none, find_backdrop
 from stages.normalise.split import split_photos
 from stages.sfm.colmap.cameras import camera_rays
 from stages.sfm.colmap.models import read_model
@@ -49,9 +50,10 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
     registration = read_json(inputs["sfm"] / "registration.json")
     split = _split(photos, config, registration["test_files"])
     alpha = find_alpha(inputs["ingest"], photos, model, order, split, find_capture_type(sfm), config.masks, progress)
+    backdrop = None if alpha is not None else find_backdrop(inputs["ingest"], photos, split)
     # What is opaque in a test photo decides nothing.
-    if alpha is not None:
-        boxes = [box if part == "train" else None for box, part in zip(alpha.opaque, split, strict=True)]
+    if (separates := alpha or backdrop) is not None:
+        boxes = [box if part == "train" else None for box, part in zip(separates.opaque, split, strict=True)]
         sfm = replace(sfm, opaque=_opaque(model, order, boxes))
     try:
         found = normalise(sfm, config.roi, _up_by_gps(registration["georeference"], sfm, photos))
@@ -60,7 +62,10 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
         raise StageError("normalise.no-scale", "the scene has no scale", str(error), hint) from error
     if alpha is not None:
         alpha = alpha_or_none(alpha, photos, found, config.roi is not None, progress)
+    if backdrop is not None:
+        backdrop = backdrop_or_none(backdrop, found, progress)
     scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split, alpha)
+    scene = replace(scene, backdrop=None if backdrop is None else backdrop.colour)
     write_json(folder / "scene.json", scene.to_json())
     write_tensors(folder / "points.safetensors", _points(model, sfm, found))
     write_json(folder / "transforms.json", transforms(scene))
@@ -73,7 +78,7 @@ def normalise_scene(config: "Config", inputs: Inputs, folder: Path, progress: Pr
         )
     return StageResult(
         outputs=("scene.json", "points.safetensors", "transforms.json"),
-        line=_line(found),
+        line=_line(scene, found),
         facts=_facts(scene, found, len(model.view)),
     )
 
@@ -170,7 +175,7 @@ def _scene(
             near=float(found.near[i]),
             far=float(found.far[i]),
             split=split[i],
-            mask=_left_as_mask(photo, of_masks[i], found.bounded),
+            mask=_left_as_mask(photo, of_masks[i], alpha is not None),
             alpha=of_masks[i],
         )
         for i, photo in enumerate(photos)
@@ -180,15 +185,15 @@ def _scene(
         views=views,
         scene_from_sfm=found.scene_from_sfm,
         bounded=found.bounded,
-        has_alpha=found.bounded,
+        has_alpha=alpha is not None,
         capture_type=found.capture_type,
         up_known=found.up.known,
     )
 
 
-def _left_as_mask(photo: Photo, alpha: str | None, bounded: bool) -> str | None:
+def _left_as_mask(photo: Photo, alpha: str | None, has_alpha: bool) -> str | None:
     """The mask of a photo's view, beside the one that is its ``alpha``."""
-    if not bounded:
+    if not has_alpha:
         return photo.opaque_mask or photo.mask
     return None if alpha else photo.mask
 
@@ -206,7 +211,7 @@ def _points(model: SparseModel, sfm: Reconstruction, found: Normalisation) -> di
     }
 
 
-def _line(found: Normalisation) -> str:
+def _line(scene: Scene, found: Normalisation) -> str:
     """What was decided, for the user."""
     arc = 360 if found.arc_deg > FULL_TURN_DEG else round(found.arc_deg / 10) * 10
     capture_type = {
@@ -214,7 +219,7 @@ def _line(found: Normalisation) -> str:
         "inside-out": "inside-out capture of a space",
         "forward-facing": "forward-facing capture",
     }[found.capture_type]
-    background = "transparent" if found.bounded else "unbounded"
+    background = "transparent" if scene.has_alpha else "plain" if scene.backdrop else "unbounded"
     up = f"up from {found.up.source}" if found.up.known else "no up vector: the cameras disagree"
     return f"{capture_type}, background {background} · {up}"
 
@@ -226,6 +231,7 @@ def _facts(scene: Scene, found: Normalisation, observations: int) -> dict[str, A
         "capture_type": scene.capture_type,
         "bounded": scene.bounded,
         "has_alpha": scene.has_alpha,
+        "backdrop": scene.backdrop,
         "up": found.up.source,
         "up_known": scene.up_known,
         "arc_deg": round(found.arc_deg, 1),

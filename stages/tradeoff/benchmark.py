@@ -96,7 +96,7 @@ def make_benchmark(ingest: Path, scene: Scene, downscale: float | None, count: i
     """About ``count`` tiles of all test photos at 1/``downscale`` of their size (None: the usual one of scores), and
     NUM_SHOWN of these photos at 1/``small``, large ones still smaller: at most SMALL_SIDE pixels, which the study has
     time to render."""
-    test, background = scene.of_split("test"), WHITE if scene.has_alpha else BLACK
+    test, background = scene.of_split("test"), WHITE if scene.has_alpha else scene.backdrop or BLACK
     reader = PhotoReader(ingest, scene, downscale)
     whole = (_photo(reader, view, background) for view in test)
     parts = (photo.tiled(math.ceil(count / len(test)), number) for number, photo in enumerate(whole))

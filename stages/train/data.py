@@ -204,8 +204,10 @@ def training_background(config: Config, scene: "Scene") -> tuple[float, float, f
 
 
 def field_background(config: Config, scene: "Scene") -> tuple[float, float, float]:
-    """What the finished field is shown over, unless it has a background model. Photos without alpha fill every ray;
-    what a field without one leaves open is black, as published."""
+    """What the finished field is shown over, unless it has a background model. Without alpha that is what the photos
+    show behind all; if they do not tell, they fill every ray, and what a field leaves open is black, as published."""
+    if scene.backdrop is not None:
+        return scene.backdrop
     return WHITE if scene.has_alpha and config.background != "black" else BLACK
 
 

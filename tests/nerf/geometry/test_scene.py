@@ -63,6 +63,7 @@ def scene() -> Scene:
         has_alpha=True,
         capture_type="inside-out",
         up_known=True,
+        backdrop=(1.0, 1 / 3, 0.0),
     )
 
 
@@ -74,11 +75,13 @@ def test_json_gives_back_every_bit() -> None:
     assert np.array_equal(again.views[0].scene_from_camera, scene().views[0].scene_from_camera)
     assert np.array_equal(again.scene_from_sfm.rotation, scene().scene_from_sfm.rotation)
     assert (again.bounded, again.has_alpha, again.capture_type, again.up_known) == (False, True, "inside-out", True)
+    assert again.backdrop == scene().backdrop
+    assert Scene.from_json(json.loads(text) | {"backdrop": None}).backdrop is None
 
 
 def test_another_version_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"scene.json has version 4, this program reads version 3"):
-        Scene.from_json(scene().to_json() | {"version": 4})
+    with pytest.raises(ValueError, match=r"scene.json has version 5, this program reads version 4"):
+        Scene.from_json(scene().to_json() | {"version": 5})
 
 
 def test_views_of_a_split() -> None:

@@ -1,5 +1,6 @@
 """What registration.json and the places of observations say, without a photo."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,7 @@ from nerf.effects.statistics.statistic import Statistic
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages.effects.scene_statistics import (
     camera_model_statistic,
+    classify_background,
     classify_poses,
     classify_rolling_shutter,
     observed_places,
@@ -18,7 +20,7 @@ from stages.effects.scene_statistics import (
 )
 from stages.effects.study import Clock
 from stages.io.photos import Photo, write_photos
-from tests.stages.photo_scene import pose_towards_origin
+from tests.stages.photo_scene import photographed, pose_towards_origin, seen_points
 
 VIEWS, POINTS = 10, 120
 
@@ -149,3 +151,14 @@ def test_why_nothing_is_known_of_the_lens(source: str, rows: list[dict[str, Any]
     found = camera_model_statistic({"source": source, "camera_models": rows})
     assert found.words == f"not measured: {why}" and found.called_for is False
     assert np.isinf(found.noise) and np.isinf(found.threshold)
+
+
+@pytest.mark.parametrize(("has_alpha", "backdrop"), [(True, None), (False, (1.0, 1.0, 1.0)), (False, None)])
+def test_alpha_and_backdrops_leave_the_background_out(
+    tmp_path: Path, has_alpha: bool, backdrop: tuple[float, float, float] | None
+) -> None:
+    inputs, scene = photographed(tmp_path)
+    scene = replace(scene, has_alpha=has_alpha, backdrop=backdrop)
+    write_photos(inputs["ingest"], [], [], {})
+    places = observed_places(inputs["ingest"], scene, seen_points(scene), {})
+    assert classify_background(places).called_for is not (has_alpha or backdrop is not None)

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from nerf import REGION_HALF_SIZE
 from nerf.geometry.camera_paths import nearest_rotations
 from nerf.geometry.scene import Camera
 from stages import normalise
@@ -32,6 +33,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         crooked: bool = False,
         opaque: Box | None = None,
         around: float = 0.0,
+        before: int | None = None,
     ) -> dict[str, Path]:
         poses = ring(count)
         if crooked:
@@ -54,6 +56,12 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             for i, photo in enumerate(photos)
         ]
         write_photos(folders["ingest"], photos, [], {})
+        (folders["ingest"] / "images").mkdir(exist_ok=True)
+        for photo in photos:
+            pixels = np.random.default_rng(0).integers(0, 256, (20, 20, 3), np.uint8)
+            if before is not None:
+                pixels[:4], pixels[-4:], pixels[:, :4], pixels[:, -4:] = before, before, before, before
+            write_png(folders["ingest"] / photo.file, pixels)
         (folders["sfm"] / "registration.json").write_text(json.dumps({"test_files": test_files, "georeference": None}))
         model = SimpleNamespace(
             cameras=[CAMERA],
@@ -177,6 +185,23 @@ def test_alpha_is_the_background_of_a_whole_object(inputs, progress, opaque: Box
     folders = inputs(transparent=17, opaque=opaque)
     run(folders, progress)
     assert read_scene(folders["normalise"]).has_alpha and progress.notes == []
+
+
+def test_before_a_plain_backdrop_the_object_is_all(inputs, progress) -> None:
+    folders = inputs(before=255)
+    assert "background plain" in run(folders, progress).line
+    scene = read_scene(folders["normalise"])
+    assert scene.bounded and not scene.has_alpha and scene.backdrop == (1.0, 1.0, 1.0)
+    assert progress.codes == ["normalise.backdrop"]
+    assert np.abs(read_tensors(folders["normalise"] / "points.safetensors")["xyz"]).max() < REGION_HALF_SIZE
+
+
+def test_a_backdrop_with_points_is_none(inputs, progress) -> None:
+    folders = inputs(before=0, around=20.0)
+    assert "background unbounded" in run(folders, progress).line
+    scene = read_scene(folders["normalise"])
+    assert not scene.bounded and scene.backdrop is None
+    assert progress.codes == ["normalise.backdrop-beyond-region"]
 
 
 def test_masks_around_an_object_become_its_alpha(inputs, progress) -> None:

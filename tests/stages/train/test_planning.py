@@ -12,7 +12,7 @@ from nerf.geometry.scene import Camera, Scene
 from stages.contract import Progress
 from stages.effects.decisions import Decisions, Space
 from stages.train import Config
-from stages.train.data import MIN_LONG_SIDE, has_background_model, scaled_size
+from stages.train.data import MIN_LONG_SIDE, field_background, has_background_model, scaled_size, training_background
 from stages.train.fields.field_list import with_defaults
 from stages.train.fields.hash_grid import (
     LARGE_STEP_LEARNING_RATE,
@@ -222,6 +222,13 @@ def test_ray_samples_multiply_the_samples_along_a_ray(space: Space, factor: floa
 def test_unbounded_space_without_alpha_has_a_background(scene: Scene, space: Space, has_alpha: bool) -> None:
     config = GRID.model_copy(update={"space": space})
     assert has_background_model(config, replace(scene, has_alpha=has_alpha)) is (space != "bounded" and not has_alpha)
+
+
+@pytest.mark.parametrize("field", [GRID, VANILLA])
+def test_an_empty_field_shows_the_backdrop(scene: Scene, field: Config) -> None:
+    before = replace(scene, has_alpha=False, backdrop=(1.0, 0.5, 0.0))
+    assert field_background(field, before) == training_background(field, before) == (1.0, 0.5, 0.0)
+    assert field_background(field, replace(before, backdrop=None)) == (0.0, 0.0, 0.0)
 
 
 def test_the_reason_for_sizes_is_the_budget() -> None:

@@ -54,16 +54,16 @@ def test_a_few_false_points_are_no_scale() -> None:
 def test_background_is_modelled_unless_alpha_rules_it_out(share: float) -> None:
     position = np.zeros((4000, 3))
     position[: int(share * 4000), 2] = -5
-    found = background_statistic(position, np.repeat(np.arange(4000), 3), False, 0.1)
+    found = background_statistic(position, np.repeat(np.arange(4000), 3), None, 0.1)
     assert found.called_for is True and abs(found.value - share) < 1e-9
     assert np.isinf([found.threshold, found.noise]).all()  # neither decides anything
     assert f"{share:.1%} of the observations" in found.words and "10% of the photos' area" in found.words
 
 
-def test_alpha_says_what_is_background() -> None:
-    assert background_statistic(np.full((9, 3), 5.0), np.arange(9), True, 0.5).called_for is False
-    assert background_statistic(np.zeros((0, 3)), np.zeros(0, int), True, 1.0).called_for is False
-    assert background_statistic(np.zeros((0, 3)), np.zeros(0, int), False, 1.0).words == "not measured: no tracks"
+def test_photos_may_tell_that_nothing_lies_beyond() -> None:
+    assert background_statistic(np.full((9, 3), 5.0), np.arange(9), "alpha", 0.5).called_for is False
+    assert background_statistic(np.zeros((0, 3)), np.zeros(0, int), "alpha", 1.0).called_for is False
+    assert background_statistic(np.zeros((0, 3)), np.zeros(0, int), None, 1.0).words == "not measured: no tracks"
 
 
 def test_untracked_parts_of_photos() -> None:
