@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 # quarter; what only shows past the edge of something else is visible in fewer (docs/experiments/mesh.md).
 MIN_VISIBLE_FRACTION = 0.2
 DILATION_STEPS = 10  # edges from a visible vertex within which faces are kept: creases and gaps close
-FRINGE_STEPS = 3  # edges of the decimated surface: what photos graze is no fringe
+FRINGE_STEPS = 1  # edges of the decimated surface (docs/experiments/mesh.md)
 MIN_VISIBLE_AREA = 0.1  # of a component's; an inner cavity has none, the visible side of an object about half
 # Of a component's area, near a sparse point. Of the demo's table 41 % lies within 0.03 of one, 57 % within 0.05; of
 # sheets of sky below it nothing within 0.3 (docs/experiments/mesh.md).
