@@ -26,7 +26,7 @@ FEW = 8  # photos, evenly spread: they can rule a backdrop out without a look at
 # Of 255, in each channel. Deviations spread evenly over this have a root mean square of 0.018 of the range of colours,
 # twice the MIN_EFFECT of nerf/effects/statistics/statistic.py: with more, leaving the backdrop out would be seen.
 TOLERANCE = 8
-# Of the borders of all photos: an object may reach an edge in some. The photos of scenes have at most 0.41
+# Of the borders of all photos: an object may reach an edge in some. The photos of scenes have at most 0.43
 # (docs/experiments/effects.md).
 MIN_SHARE = 0.9
 
