@@ -52,7 +52,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 STAGE = Stage(
     name="normalise",
     inputs=("ingest", "sfm"),
-    version=20,
+    version=21,
     exit_code=12,
     published=("transforms.json", "scene.json"),
     config=Config,

@@ -193,7 +193,7 @@ def _line(registration: dict[str, Any]) -> str:
 STAGE = Stage(
     name="sfm",
     inputs=("ingest",),
-    version=37,
+    version=38,
     exit_code=11,
     resumes=True,
     published=("sparse", "registration.json", "photo_groups"),
