@@ -37,7 +37,7 @@ MAX_OTHER_FILES = 2  # files beside a video, too few to be a set of photos
 FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
 _LIST_HINT = "Write one photo name per line, relative to PHOTOS, in UTF-8; lines that begin with # are ignored."
 _LIST_GONE = (
-    "Check the path. If the list moved, put it back or give its new path: pipeline run PHOTOS --ingest.photo-list FILE; "
+    "Check the path. If the list moved, put it back or give its path: pipeline run PHOTOS --ingest.photo-list FILE; "
     "the same list keeps all results."
 )
 _LINKS_HINT = "Fetch them (git annex get, dvc pull), or connect the drive that holds them."
