@@ -181,13 +181,15 @@ class Workload(NamedTuple):
     """What is known before a run begins, for stages to estimate their time.
 
     ``facts(stage, key)`` gives what a finished stage told of itself: under that key, or with None the one that the run
-    will find; None where there is none, or where the run makes another.
+    will find; None where there is none, or where the run makes another. ``partial(stage)`` is the folder that the run
+    resumes the stage from; None where it begins anew.
     """
 
     photos: Photos
     cores: int
     options: Mapping[str, Any]
     facts: Callable[[str, str | None], Mapping[str, Any] | None]
+    partial: Callable[[str], Path | None] = lambda _: None
 
 
 class BudgetLeft(NamedTuple):
@@ -265,7 +267,7 @@ class Stage(Generic[C]):
     """It shows the whole run: of its ``inputs`` it takes what is there, with records and timings, and the account of a
     budget; it is brought up to date after whichever stage was run alone."""
     expected_seconds: Callable[[C, Workload], float | None] = lambda *_: None
-    """What it takes without a budget; None where nobody can tell."""
+    """What it takes without a budget, or what is left of that where it resumes; None where nobody can tell."""
     flexible: Flexible | None = None
     """It fills whatever seconds a budget gives it."""
     budget_seconds: Callable[[BudgetLeft], float] | None = None

@@ -15,7 +15,7 @@ from stages.contract import StageError
 from stages.io.amounts import duration
 
 JSON_SECONDS = 0.2  # JSON output: one progress event at most this often
-HEARTBEAT_SECONDS = 10.0  # plain output: one line at most this often, so that a log stays readable
+HEARTBEAT_SECONDS = 10.0  # plain output: one line at most this often, and only a new one, so that a log stays readable
 
 
 def end_line(stage: str, line: str, seconds: float, cached: bool) -> str:
@@ -72,7 +72,7 @@ class PlainDisplay:
 
     def __init__(self) -> None:
         self._stage = ""
-        self._last = 0.0
+        self._last, self._said = 0.0, ""
         self._lock = threading.Lock()
 
     def _say(self, text: str) -> None:
@@ -83,14 +83,15 @@ class PlainDisplay:
         self._say(text)
 
     def begin(self, stage: str) -> None:
-        self._stage, self._last = stage, time.monotonic()
+        self._stage, self._last, self._said = stage, time.monotonic(), ""
 
     def update(self, message: str, done: float | None = None) -> None:
         now = time.monotonic()
-        if self._stage and now - self._last >= HEARTBEAT_SECONDS:
-            self._last = now
-            share = "" if done is None else f" {100 * done:.0f}%"
-            self._say(f"{self._stage:<10} …{share} {message}")
+        share = "" if done is None else f" {100 * done:.0f}%"
+        line = f"{self._stage:<10} …{share} {message}"
+        if self._stage and now - self._last >= HEARTBEAT_SECONDS and line != self._said:
+            self._last, self._said = now, line
+            self._say(line)
 
     def note(self, code: str, text: str) -> None:
         self._say(f"{self._stage:<10} {text}")

@@ -76,7 +76,10 @@ class Runner:
                 except (FileNotFoundError, BadManifest):
                     return None
 
-            workload = Workload(photos, processors(), self.options, facts)
+            def partial(stage: str) -> Path | None:
+                return None if stage in again else self._resumed(stage)
+
+            workload = Workload(photos, processors(), self.options, facts, partial)
             return forecast_run(STAGES, to_run, workload, self.budget.left())
         except StageError:
             return Forecast([], {})
@@ -87,6 +90,18 @@ class Runner:
             return self._upstream(stage, needed=False) if self.run_file.keys else None
         finally:
             self.done.clear()  # what runs now may make it outdated
+
+    def _resumed(self, stage: str) -> Path | None:
+        """The folder that an interrupted attempt at ``stage`` left to go on from, as far as can be told beforehand."""
+        try:
+            if not STAGES[stage].resumes or not self.run_file.keys:
+                return None
+            folder = self.workspace.partial(stage, self.resolve(stage, may_plan=False).key)
+            return folder if folder.is_dir() else None
+        except NotReady:
+            return None
+        finally:
+            self.done.clear()
 
     def run(
         self,

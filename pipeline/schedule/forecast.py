@@ -88,8 +88,10 @@ def forecast_run(stages: Stages, to_run: Collection[str], workload: Workload, bu
     exempt = [name for name in to_run if stages[name].is_exempt(workload.options[name])]
     if exempt and all(name in exempt or stages[name].summary for name in to_run):
         budget = None
-    times = expected_times(stages, workload, budget is not None)
-    ahead = {name: times[name] if name in times else _own(stages[name], workload) for name in stages if name in to_run}
+    whole = workload._replace(partial=lambda _: None)  # a report and limits of later stages count all of a stage
+    times = expected_times(stages, whole, budget is not None)
+    left = expected_times(stages, workload, budget is not None)
+    ahead = {name: left[name] if name in left else _own(stages[name], workload) for name in stages if name in to_run}
     known = [seconds for seconds in ahead.values() if seconds is not None]
     unknown = [name for name in ahead.keys() - exempt if ahead[name] is None]
     if budget is None:

@@ -53,7 +53,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 STAGE = Stage(
     name="depth",
     inputs=("ingest", "normalise"),
-    version=4,
+    version=5,
     exit_code=20,
     resumes=True,
     published=("points.ply",),

@@ -36,6 +36,10 @@ _OF_SYSTEMS = (
 MAX_OTHER_FILES = 2  # files beside a video, too few to be a set of photos
 FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
 _LIST_HINT = "Write one photo name per line, relative to PHOTOS, in UTF-8; lines that begin with # are ignored."
+_LIST_GONE = (
+    "Check the path. If the list moved, put it back or give its path: pipeline run PHOTOS --ingest.photo-list FILE; "
+    "the same list keeps all results."
+)
 _LINKS_HINT = "Fetch them (git annex get, dvc pull), or connect the drive that holds them."
 
 
@@ -150,7 +154,7 @@ def read_photo_list(file: Path) -> list[str]:
         text = file.read_bytes().decode("utf-8-sig")  # -sig: Windows writes a byte order mark
     except OSError as error:
         why = (error.strerror or str(error)).lower()
-        raise StageError("ingest.photo-list-unreadable", what, why, "Check --ingest.photo-list.") from error
+        raise StageError("ingest.photo-list-unreadable", what, why, _LIST_GONE) from error
     except UnicodeDecodeError as error:
         why = f"it is not text in UTF-8 (byte {error.start} is 0x{error.object[error.start]:02x})"
         raise StageError("ingest.photo-list-encoding", what, why, _LIST_HINT) from error

@@ -72,7 +72,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 STAGE = Stage(
     name="scale",
     inputs=("ingest", "sfm", "normalise"),
-    version=4,
+    version=5,
     exit_code=22,
     published=("scale.json",),
     config=Config,

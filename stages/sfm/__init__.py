@@ -139,11 +139,21 @@ def expected_seconds(config: Config, workload: Workload) -> float:
         return 5.0 + 0.3 * photos.number * 2 / cores + 0.1 * photos.number
     chosen = photos.number > MAX_EXHAUSTIVE and config.matcher != "exhaustive"
     pairs = 16.5 * photos.number if chosen else photos.number * (photos.number - 1) / 2
+    extracted, matched = _done(workload.partial("sfm"))
     doubled = 4 if photos.megapixels < MAX_DOUBLED_MEGAPIXELS else 1
-    features = 0.25 * photos.number * min(doubled * photos.megapixels, 1.7)
-    matching = (0.04 if chosen else 0.02) * pairs
+    features = 0.25 * max(0, photos.number - extracted) * min(doubled * photos.megapixels, 1.7)
+    matching = (0.04 if chosen else 0.02) * max(0.0, pairs - matched)
     mapping = (0.8 if chosen else 0.4) * photos.number
     return 4.0 + photos.reading_seconds(cores) + (features + matching) * 2 / cores + mapping
+
+
+def _done(partial: Path | None) -> tuple[int, int]:
+    """How many photos have features and how many pairs are matched where the stage resumes."""
+    if partial is None:
+        return 0, 0
+    from stages.sfm.registration import count_done, first_database
+
+    return count_done(first_database(partial))
 
 
 def budget_seconds(left: BudgetLeft) -> float:
@@ -193,7 +203,7 @@ def _line(registration: dict[str, Any]) -> str:
 STAGE = Stage(
     name="sfm",
     inputs=("ingest",),
-    version=37,
+    version=38,
     exit_code=11,
     resumes=True,
     published=("sparse", "registration.json", "photo_groups"),

@@ -2,7 +2,6 @@
 
 import shutil
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +31,7 @@ from stages.sfm.registration import (
     OVERLAP_HINT,
     PHOTO_GROUPS,
     count_done,
+    first_database,
     image_rows,
     is_sound,
     photo_groups,
@@ -209,9 +209,9 @@ def _wait_for_worker(folder: Path, progress: Progress) -> None:
 def _database(folder: Path, names: Sequence[str], progress: Progress) -> Path:
     """The database of features and matches: an interrupted run's if it can be trusted, else none yet.
 
-    Its settings are those of the folder's key; COLMAP's version is not part of the key, so it is in the name.
+    Its settings are those of the folder's key.
     """
-    database = folder / f"matches-{version('pycolmap')}.db"
+    database = first_database(folder)
     if not database.exists():
         _remove_intermediate(folder)  # strategies without their matches, or those of another version of COLMAP
         return database

@@ -8,6 +8,7 @@ import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -58,13 +59,20 @@ def _opened(database: Path) -> Iterator[sqlite3.Connection]:
         yield connection
 
 
+def first_database(folder: Path) -> Path:
+    """The database of features and matches of the first strategy. COLMAP's version is in its name, for it is not part
+    of the key that the stage's folder has."""
+    return folder / f"matches-{version('pycolmap')}.db"
+
+
 def count_done(database: Path) -> tuple[int, int]:
-    """How many photos have features and how many pairs are matched; (0, 0) while there is nothing to read yet."""
+    """How many photos have features and how many pairs are matched; (0, 0) where there is nothing to read yet or
+    the database is damaged."""
     try:
         with _opened(database) as db:
             photos = db.execute("SELECT COUNT(*) FROM descriptors").fetchone()[0]
             return photos, db.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0]
-    except sqlite3.OperationalError:  # not created yet, or locked for a moment
+    except sqlite3.DatabaseError:  # also: not created yet, or locked for a moment
         return 0, 0
 
 

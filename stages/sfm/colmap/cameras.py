@@ -4,14 +4,17 @@ from functools import lru_cache
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from nerf.geometry.scene import Camera
 from stages.contract import StageError
 
 ROUND_TRIP_PX = 0.01  # a ray direction that does not project back to its pixel is a false root of the distortion
+FOLD_STEP = 1e-3  # of the way from the axis to a ray: in this last step pixels move outwards, unless a distortion folds
+BISECTIONS = 50
 ANGLE_MARGIN = 0.02  # of cosines: a surface goes on beside the photos that show it
 CHECKED_PIXELS = (33, 25)  # across and down, the very corners among them: there lenses bend most
+AXIS = np.array([0.0, 0.0, 1.0])  # the optical axis, in the camera's frame
 _CLOCKWISE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # of a picture, by a quarter turn
 # Parameters of COLMAP's lenses that are the two parts of a vector in the picture, and turn with it. Tangential terms
 # are 2 (q·u) u + |u|² q of u = (X, Y) / Z (of the angle for a fisheye), and OPENCV calls q (p2, p1).
@@ -49,7 +52,7 @@ def border_rays(camera: Camera) -> Float[np.ndarray, "border 3"]:
 def corner_chord_squared(camera: Camera) -> float:
     """4 sin²(θ/2) of the largest angle θ between the optical axis and a pixel of a camera's image: the squared length
     of the difference of their unit vectors."""
-    away = border_rays(camera) - [0.0, 0.0, 1.0]
+    away = border_rays(camera) - AXIS
     return float((away**2).sum(axis=1).max())
 
 
@@ -68,9 +71,40 @@ def ray_directions(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> Float[np
 
 def _ray_directions(model: pycolmap.Camera, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], int]:
     """Unit ray directions of pixels, and how many of these they are not those of."""
-    ray_directions = np.asarray(model.cam_ray_from_img(pixels))
+    ray_directions = _before_fold(model, pixels, np.array(model.cam_ray_from_img(pixels)))
     miss = np.abs(np.asarray(model.img_from_cam(ray_directions)) - pixels).max(axis=1)
     return ray_directions, int(np.count_nonzero(~(miss < ROUND_TRIP_PX)))  # NaN counts as lost
+
+
+def _before_fold(
+    model: pycolmap.Camera, pixels: Float[np.ndarray, "n 2"], rays: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """The unit rays of pixels. Where the distortion folds back between the optical axis and a ray, it makes way for the
+    first one on the way there that projects to the pixel.
+
+    COLMAP looks for a ray from where the pixel would be without distortion. A distortion that folds back a little
+    beyond the corners gives pixels there two rays, and that start may be nearer to the false one.
+    """
+    outward = pixels - np.asarray(model.img_from_cam(AXIS[None]))
+
+    def on_the_way(share: Float[np.ndarray, "k"], of: np.ndarray) -> Float[np.ndarray, "k 3"]:
+        return AXIS + share[:, None] * (rays[of] - AXIS)
+
+    def is_beyond(share: Float[np.ndarray, "k"], of: np.ndarray) -> Bool[np.ndarray, "k"]:
+        """Whether what lies at this share of the way from the axis to a ray projects farther out than its pixel."""
+        projected = np.asarray(model.img_from_cam(on_the_way(share, of)))
+        return ((projected - pixels[of]) * outward[of]).sum(axis=1) > 0
+
+    ahead = np.flatnonzero(rays[:, 2] > 0)
+    folded = ahead[is_beyond(np.full(len(ahead), 1 - FOLD_STEP), ahead)]
+    near, far = np.zeros(len(folded)), np.ones(len(folded))
+    for _ in range(BISECTIONS if len(folded) else 0):
+        middle = (near + far) / 2
+        beyond = is_beyond(middle, folded)
+        near, far = np.where(beyond, near, middle), np.where(beyond, middle, far)
+    first = on_the_way(far, folded)
+    rays[folded] = first / np.linalg.norm(first, axis=1, keepdims=True)
+    return rays
 
 
 def no_ray(camera: Camera, share: float, of: str = "") -> StageError:

@@ -111,6 +111,18 @@ def test_streams_that_were_closed_are_no_error(closed: str, tmp_path: Path):
         assert ended.returncode == code and "Traceback" not in ended.stderr
 
 
+def test_plain_lines_are_due_only_with_news(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    seconds = iter([0.0, 5.0, 11.0, 22.0, 33.0, 34.0, 50.0, 51.0, 62.0])
+    monkeypatch.setattr("pipeline.cli.terminal.time.monotonic", lambda: next(seconds))
+    display = PlainDisplay()
+    display.begin("sfm")
+    for message, done in (("a", 0.0), ("a", 0.0), ("a", 0.0), ("b", 0.001), ("c", 0.0), ("c", 0.2)):
+        display.update(message, done)  # too early, due, nothing new, due, too early, due
+    display.begin("train")
+    display.update("c", 0.2)
+    assert [line.split()[-1] for line in capsys.readouterr().out.splitlines()] == ["a", "b", "c", "c"]
+
+
 def test_updates_before_the_first_stage_have_no_line(capsys: pytest.CaptureFixture[str]):
     for as_json in (False, True):
         with choose_display(as_json) as display:

@@ -64,6 +64,16 @@ def test_the_workspace_remembers_its_list(photos: Path, tmp_path: Path, monkeypa
     assert [folder for folder in (workspace / "ingest").iterdir() if folder.is_dir()] == [finished]
 
 
+def test_a_list_that_moved_keeps_results_under_its_new_path(photos: Path, tmp_path: Path):
+    run = ["run", str(photos), "-o", str(tmp_path / "w.nerf"), "--until", "ingest", "--ingest.photo-list"]
+    assert run_command([*run, str(listing(tmp_path / "list.txt", "20.png", "24.png"))]) == 0
+    (finished,) = (tmp_path / "w.nerf/ingest").iterdir()
+    moved = (tmp_path / "list.txt").rename(tmp_path / "moved.txt")
+    assert run_command(["resume", str(tmp_path / "w.nerf")]) == 10
+    assert run_command([*run, str(moved)]) == 0
+    assert [*(tmp_path / "w.nerf/ingest").iterdir()] == [finished]
+
+
 def test_a_wrong_list_leaves_results_in_place(photos: Path, tmp_path: Path):
     workspace = tmp_path / "w.nerf"
     run = ["run", str(photos), "-o", str(workspace), "--until", "ingest"]

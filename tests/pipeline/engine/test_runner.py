@@ -57,6 +57,23 @@ def bring(tmp_path: Path, photos: Path) -> Bring:
     return go
 
 
+@pytest.mark.parametrize("again", [(), ("train",)], ids=["resumed", "forced"])
+def test_a_forecast_is_of_what_is_left(again, bring: Bring, tmp_path: Path, photos: Path, monkeypatch):
+    seen = list[Any]()
+    declare(monkeypatch, "train", expected_seconds=lambda config, work: seen.append(work.partial("train")))
+    settings = FakeSettings.model_validate({"ingest": {"photos": photos}, "train": {"die_at": 2}})
+    with Workspace(tmp_path / "w.nerf") as workspace:
+        Runner(workspace, settings, SilentDisplay()).forecast(ALL, ())  # type: ignore[arg-type]
+    with pytest.raises(KeyboardInterrupt):
+        bring(train={"die_at": 2})
+    assert seen and set(seen) == {None}
+    with Workspace(tmp_path / "w.nerf") as workspace:
+        runner = Runner(workspace, settings, SilentDisplay())  # type: ignore[arg-type]
+        runner.forecast(ALL, again)
+    (partial,) = (tmp_path / "w.nerf" / "train").glob("*.partial")
+    assert set(seen) == ({None} if again else {None, partial})
+
+
 def reader(root: Path) -> tuple[Workspace, Runner]:
     workspace = Workspace.existing(root)
     options = FakeSettings.model_validate(workspace.read_run().options)

@@ -1,7 +1,9 @@
 """What is said at the start of a run of how long it takes."""
 
+import sqlite3
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,9 @@ from stages import sfm
 from stages.contract import Photos, Workload
 from stages.effects import STATISTICS_SECONDS
 from stages.effects import Config as EffectsConfig
+from stages.io.amounts import rough_duration
 from stages.io.video import video_writer
+from stages.sfm.registration import first_database
 from stages.train import Config as TrainConfig
 from tests.png_files import png
 
@@ -94,6 +98,31 @@ def test_expected_sfm_time_is_roughly_right(set_of: Photos, measured: float) -> 
     """fox, fountain_p11 and fern on two idle cores."""
     assert measured / 2.5 < sfm_seconds(set_of, 2) < 2.5 * measured
     assert sfm_seconds(set_of, 16) < sfm_seconds(set_of, 2)
+
+
+def test_of_a_resumed_stage_only_the_rest_counts(tmp_path: Path) -> None:
+    set_of, given = Photos(100, 2.0), Settings.model_validate({"train": {"seconds": 100.0}})
+
+    def done(features: int, pairs: int) -> tuple[float, float]:
+        """The seconds until the end of stage sfm, and those that it is expected to take in all."""
+        with closing(sqlite3.connect(first_database(tmp_path))) as db, db:
+            for table, count in {"descriptors": features, "two_view_geometries": pairs}.items():
+                db.execute(f"DROP TABLE IF EXISTS {table}")
+                db.execute(f"CREATE TABLE {table} (id)")
+                db.executemany(f"INSERT INTO {table} VALUES (?)", [(k,) for k in range(count)])
+        resumed = workload(given, set_of)._replace(partial={"sfm": tmp_path}.get)
+        found = forecast_run(STAGES, ["sfm"], resumed, None)
+        left = sfm.expected_seconds(given.sfm, resumed)
+        assert rough_duration(left) in found.messages[0]
+        return left, found.times["sfm"] or 0.0
+
+    whole = sfm_seconds(set_of, 2)
+    assert done(0, 0) == (whole, whole)
+    assert whole > 10 + done(50, 0)[0] > 20 + done(100, 0)[0]
+    assert done(100, 1650)[0] < done(100, 800)[0] < done(100, 0)[0] and done(100, 800)[1] == whole
+    assert done(100, 9999) == done(100, 1650)
+    first_database(tmp_path).write_bytes(b"no database at all")
+    assert sfm.expected_seconds(given.sfm, workload(given, set_of)._replace(partial={"sfm": tmp_path}.get)) == whole
 
 
 def test_imported_poses_take_seconds() -> None:

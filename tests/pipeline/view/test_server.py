@@ -55,7 +55,9 @@ class Served:
 
     def __init__(self, training: RunningTraining) -> None:
         self.training, self.server = training, ViewServer(training.root)
-        self.thread = threading.Thread(target=self.server.server.run, kwargs={"sockets": [self.server.listener]})
+        sockets = {"sockets": [self.server.listener]}
+        # daemon: a test that fails before it closes the server lets the program end all the same
+        self.thread = threading.Thread(target=self.server.server.run, kwargs=sockets, daemon=True)
         self.thread.start()
 
     def ask(self, at: str = "state", way: str = "GET", whole: str | None = None, **headers: str) -> Answer:
@@ -200,7 +202,7 @@ def test_it_loads_what_packs_fields_before_it_yields(tmp_path: Path, monkeypatch
     monkeypatch.setattr(server.server, "run", lambda sockets: seen.put(os.getpriority(os.PRIO_PROCESS, 0)))
     server.state.prepare = lambda: seen.put(os.getpriority(os.PRIO_PROCESS, 0))
     before = os.getpriority(os.PRIO_PROCESS, 0)
-    threading.Thread(target=server.run).start()
+    threading.Thread(target=server.run, daemon=True).start()
     assert sorted(seen.get(timeout=60) for _ in range(2)) == [before, min(19, before + NICENESS)]
     server.listener.close()
 
@@ -227,7 +229,7 @@ def test_a_page_gets_its_first_field_before_torch_is_loaded(
     monkeypatch.setattr("pipeline.view.server.DRAW_SECONDS", 0.0)
     server, loaded = ViewServer(running.root), threading.Event()
     server.state.prepare = loaded.set
-    serving = threading.Thread(target=server.run)
+    serving = threading.Thread(target=server.run, daemon=True)
     serving.start()
 
     def asked(at: str) -> bytes:

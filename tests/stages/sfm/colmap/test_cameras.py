@@ -55,6 +55,18 @@ def test_distortion_that_cannot_be_undone_is_refused_with_its_share(k: float) ->
         camera_rays(lens("SIMPLE_RADIAL", 30.0, 30.0, 20.0, k), W, H)
 
 
+def test_rays_lie_before_a_fold_beyond_the_corners() -> None:
+    """The lens that the 34 photos of LLFF's flower call for: two angles have the radius of a corner."""
+    focal, *terms = 48.4, 0.73858, -3.44092, 13.11131, -16.31588
+    rays = camera_rays(lens("OPENCV_FISHEYE", focal, focal, W / 2, H / 2, *terms), W, H)
+    x, y = np.meshgrid(np.arange(W) + 0.5 - W / 2, np.arange(H) + 0.5 - H / 2)
+    angle = np.linspace(0, np.radians(40), 10_001)  # up to the fold, at 40.7 degrees
+    radius = focal * angle * np.polyval([*terms[::-1], 1], angle**2)
+    expected = np.interp(np.hypot(x, y), radius, angle)
+    np.testing.assert_allclose(np.arccos(rays[..., 2].astype(float)), expected, atol=2e-4)
+    np.testing.assert_allclose(np.arctan2(rays[..., 1], rays[..., 0]), np.arctan2(y, x), atol=1e-5)
+
+
 @pytest.mark.parametrize(("model", "focals", "terms"), [("SIMPLE_FISHEYE", 1, 0), ("OPENCV_FISHEYE", 2, 4)])
 def test_a_fisheye_of_180_degrees_is_to_be_cropped(model: str, focals: int, terms: int) -> None:
     def cropped_to(side: int) -> Camera:
