@@ -53,7 +53,6 @@ LATE = {
     "pipeline/__main__.py": "Ctrl-C ends the program quietly while Python still reads it",
     "stages/train/validation_images.py": "kornia takes seconds, and few trainings score whole patches",
     "pipeline/view/workspace_state.py": "the page is there at once, and torch takes seconds, which only a field needs",
-    "stages/mesh/files/usdz.py": "usd-core is an extra",
     "benchmarks/nerfacto.py": "a part runs in nerfstudio's environment, where ours is not installed",
 }
 # What a test may replace beside the package that it mirrors (tests/stages/mesh: stages/mesh), and libraries.

@@ -124,7 +124,7 @@ def cut_unseen(surface: Surface, seen: np.ndarray, min_component: float) -> tupl
     """
     for _ in range(FRINGE_STEPS):
         seen = _dilated(surface.faces, seen)
-    fringe = _ends_openly(surface, ~seen[surface.faces].any(axis=1))
+    fringe = _ends_openly(surface, np.logical_not(seen[surface.faces].any(axis=1)))
     if not fringe.any() or fringe.all():
         return surface, np.arange(len(surface.vertices))
     rest, left = keep_faces(surface, ~fringe)

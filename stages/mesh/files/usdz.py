@@ -5,6 +5,7 @@ material gives off the colours and reflects nothing (UsdPreviewSurface), for the
 """
 
 import zipfile
+from importlib import import_module
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
@@ -43,6 +44,11 @@ def check_installed() -> None:
         )
 
 
+def usd(module: str) -> Any:
+    """A module of usd-core, which names no types."""
+    return import_module(f"pxr.{module}")
+
+
 def usdz_bytes(drawn: Drawn, upright_from_mesh: np.ndarray) -> bytes:
     """A package of the mesh, moved by ``upright_from_mesh`` (4, 4) to +y up. Equal meshes give equal bytes."""
     with TemporaryDirectory() as folder:
@@ -55,8 +61,7 @@ def usdz_bytes(drawn: Drawn, upright_from_mesh: np.ndarray) -> bytes:
 
 
 def _write_layer(drawn: Drawn, upright_from_mesh: np.ndarray, path: Path) -> None:
-    from pxr import Gf, Sdf, Usd, UsdGeom, Vt
-
+    Gf, Sdf, Usd, UsdGeom, Vt = (usd(name) for name in ("Gf", "Sdf", "Usd", "UsdGeom", "Vt"))
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -86,12 +91,10 @@ def _write_layer(drawn: Drawn, upright_from_mesh: np.ndarray, path: Path) -> Non
 
 def _add_material(stage: Any, mesh: Any, textured: bool) -> None:
     """Black, and giving off the colours: phones' light neither shades nor tints them."""
-    from pxr import Sdf, UsdShade
-
-    types = Sdf.ValueTypeNames
+    UsdShade, types = usd("UsdShade"), usd("Sdf").ValueTypeNames
     material = UsdShade.Material.Define(stage, "/scene/radiance")
 
-    def shader(name: str, kind: str) -> UsdShade.Shader:
+    def shader(name: str, kind: str) -> Any:
         made = UsdShade.Shader.Define(stage, f"/scene/radiance/{name}")
         made.CreateIdAttr(kind)
         return made

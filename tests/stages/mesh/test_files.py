@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from pxr import Usd, UsdGeom, UsdValidation
 from trimesh.visual import ColorVisuals
 
 from nerf.rendering.srgb_arrays import linear_light
@@ -128,6 +127,7 @@ def test_usdz_is_read_back_and_valid(tmp_path, mesh, textured):
     content = usdz_file(mesh, upright)
     assert content == usdz_file(mesh, upright)
     (tmp_path / "mesh.usdz").write_bytes(content)
+    Usd, UsdGeom, UsdValidation = (usdz.usd(name) for name in ("Usd", "UsdGeom", "UsdValidation"))
     scene = Usd.Stage.Open(str(tmp_path / "mesh.usdz"))
     found = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators()).Validate(scene)
     assert [each.GetMessage() for each in found] == []
