@@ -53,5 +53,5 @@ def test_a_colmap_models_own_errors_are_not_believed(error: float) -> None:
 def test_a_lens_without_an_inverse_is_refused() -> None:
     files = dict(colmap_models()["bin"])
     cameras = bytearray(files["cameras.bin"])
-    struct.pack_into("<d", cameras, 8 + 24 + 32, 1e16)
+    struct.pack_into("<d", cameras, 8 + 24 + 32, -1e16)
     assert not attempt(LOADERS["colmap binary"], {**files, "cameras.bin": bytes(cameras)})
