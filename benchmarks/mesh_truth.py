@@ -90,9 +90,9 @@ def flatness(plane: Plane, visible: Points, nearest: np.ndarray) -> float:
     return 1.4826 * float(np.median(np.abs(off - np.median(off))))
 
 
-def trained(scene: SyntheticPhotos, folder: Path, name: str, steps: int) -> Inputs:
+def trained(scene: SyntheticPhotos, folder: Path, name: str, steps: int, depth: bool) -> Inputs:
     """The folders of the stages that a mesh reads; what is there already is not made again."""
-    photos, workspace = folder / "photos" / name, folder / "ws" / name
+    photos, workspace = folder / "photos" / name, folder / ("ws-depth" if depth else "ws") / name
     write_photos(scene, photos)
     words = [
         "run",
@@ -103,6 +103,7 @@ def trained(scene: SyntheticPhotos, folder: Path, name: str, steps: int) -> Inpu
         "train",
         "--train.steps",
         str(steps),
+        *(["--train.depth"] if depth else []),
     ]
     if run_command(words) != 0:
         raise SystemExit(f"{name} was not trained")
@@ -142,6 +143,7 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=800)
     parser.add_argument("--photos", type=int, help="how many (default: 40 of the demo, 60 of a solid, 20 of the room)")
     parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--depth", action="store_true", help="supervise the fields by depth maps")
     parser.add_argument("--resolution", type=int)
     parser.add_argument("--shift", type=float, default=0.0)
     parser.add_argument("--iso-factor", type=float, default=1.0)
@@ -150,7 +152,7 @@ def main() -> None:
     record = Record(given.out)
     for name in given.scenes:
         scene = scene_of(name, given.solids, given.width, given.photos)
-        folders = trained(scene, given.folder, name, given.steps)
+        folders = trained(scene, given.folder, name, given.steps, given.depth)
         source = load(folders, SilentProgress())
         asked = Config(resolution=given.resolution, texture_size=0)
         config = plan_stage(mesh.STAGE, asked, folders, SilentProgress())
