@@ -87,9 +87,11 @@ class PlainDisplay:
 
     def update(self, message: str, done: float | None = None) -> None:
         now = time.monotonic()
+        if not self._stage or now - self._last < HEARTBEAT_SECONDS:
+            return
         share = "" if done is None else f" {100 * done:.0f}%"
         line = f"{self._stage:<10} …{share} {message}"
-        if self._stage and now - self._last >= HEARTBEAT_SECONDS and line != self._said:
+        if line != self._said:
             self._last, self._said = now, line
             self._say(line)
 
