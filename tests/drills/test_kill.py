@@ -5,7 +5,7 @@ import os
 import random
 import shutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from nerf.fields.interface import Rendering
 from pipeline.engine.manifest_file import Manifest
 from pipeline.engine.stage_list import usual
 from pipeline.engine.workspace import Workspace
+from stages.render import video
 from stages.sfm import worker_process
 from stages.sfm.worker_process import FIRST_STRATEGY, PHASES, REFINING
 from tests.drills.campaigns import RETRY, SFM_INSTANTS, Chain, reached
@@ -72,12 +74,22 @@ def videos_plan(workspace: Path) -> dict[str, Any]:
     return next(plan for plan in plans if plan["depth"] is False)
 
 
+def die_after_a_frame() -> None:
+    """In the program: it is killed when the first frame of the video is rendered."""
+    render_path = video.render_path
+
+    def die(*arguments: Any) -> Iterator[Rendering]:
+        yield next(render_path(*arguments))
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    video.render_path = die
+
+
 def test_a_killed_video_resumes_at_the_chosen_size(chain: Chain, tmp_path: Path):
     workspace = copy_workspace(chain.workspace, tmp_path / "w.nerf")
     open_again = "--render.frames None --render.width None --render.no-depth".split()
-    assert kill_in(
-        "render", Program(["render", str(workspace), "--json", *open_again], tmp_path / "says"), 0.0, at_work
-    )
+    struck = Program(["render", str(workspace), "--json", *open_again], tmp_path / "says", die_after_a_frame)
+    assert struck.wait() == -signal.SIGKILL
     chosen = videos_plan(workspace)
     Program(["render", str(workspace), "--json"], tmp_path / "says").finish()
     assert videos_plan(workspace) == chosen
