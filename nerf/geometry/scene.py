@@ -70,6 +70,12 @@ class View:
     alpha: str | None = None
 
 
+# Of 255, in each channel: within this a colour is that of a plain backdrop. Deviations spread evenly over it have a
+# root mean square of 0.018 of the range of colours, twice the MIN_EFFECT of nerf/effects/statistics/statistic.py: with
+# more, leaving the backdrop out would be seen.
+BACKDROP_TOLERANCE = 8
+
+
 @dataclass(frozen=True)
 class Scene:
     """Everything that training and rendering need to know of the geometry.

@@ -1,6 +1,14 @@
-"""The colour loss of the hash-grid field: squares of small errors, and no more than linear in those that stand out."""
+"""Losses of what a ray shows.
 
-from jaxtyping import Float
+Of colours, for the hash-grid field: squares of small errors, and no more than linear in those that stand out.
+
+Of opacity, where a photo shows a plain backdrop: the square of the tolerance within which a colour counts as the
+backdrop's. Matter of that colour costs nothing there, and a field leaves it wherever no photo sees it before anything
+else: black lumps around an object before black. So being opaque costs as much as an error that nobody would see, far
+less than what a photo that does see a part of the object knows of it.
+"""
+
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 HUBER_DELTA = 0.1
@@ -19,3 +27,10 @@ def huber_loss(
     """
     half_gradient = error.clamp(-HUBER_DELTA, HUBER_DELTA)
     return half_gradient * (2 * error - half_gradient), half_gradient
+
+
+def shows_backdrop(
+    colour: Float[Tensor, "rays 3"], backdrop: Float[Tensor, "*rays 3"], tolerance: float
+) -> Bool[Tensor, "rays"]:
+    """Which colours are the backdrop's, up to ``tolerance`` in each channel."""
+    return (colour - backdrop).abs().amax(1) <= tolerance

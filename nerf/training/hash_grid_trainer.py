@@ -20,7 +20,7 @@ from nerf.geometry.rays import Rays
 from nerf.runtime.parallel import in_order
 from nerf.runtime.profiler import WorkCounts, span
 from nerf.runtime.randomness import generator
-from nerf.training.colour_loss import huber_loss
+from nerf.training.colour_loss import huber_loss, shows_backdrop
 from nerf.training.frustum_mask import compute_frustum_mask
 from nerf.training.learning_rate import lr_multiplier
 from nerf.training.pixel_sampler import PixelSampler
@@ -55,10 +55,11 @@ class HashGridTrainerSettings:
     colour behind a scene without a background model, or another random one for each ray (only for photos with alpha,
     where it shows the field which space is empty). ``distortion_weight``: full weight of the distortion loss, for
     scenes without a known background. ``depth_weight``: initial weight of the depth loss, at sparse points and where
-    depth maps know the distance. ``min_photos``: how many photos must see a cell of unbounded space before their
-    foregrounds for it to hold density (nerf/training/frustum_mask.py), or all but one where they are few. Up to a
-    progress of ``long_steps_until``, steps along rays are LONG_STEP_FACTOR times as long, so that a ray has fewer
-    samples while surfaces are still thick; a CUDA graph holds one length for all steps.
+    depth maps know the distance. ``backdrop_tolerance``: of the one colour that photos show where nothing is, in [0,
+    1]; 0: they show other things (nerf/training/colour_loss.py). ``min_photos``: how many photos must see a cell of
+    unbounded space before their foregrounds for it to hold density (nerf/training/frustum_mask.py), or all but one
+    where they are few. Up to a progress of ``long_steps_until``, steps along rays are LONG_STEP_FACTOR times as long,
+    so that a ray has fewer samples while surfaces are still thick; a CUDA graph holds one length for all steps.
     """
 
     seed: int
@@ -68,6 +69,7 @@ class HashGridTrainerSettings:
     learning_rate: float = 2e-2
     distortion_weight: float = 0.0
     depth_weight: float = 0.0
+    backdrop_tolerance: float = 0.0
     min_photos: int = 1
     long_steps_until: float = 0.0
 
@@ -87,10 +89,12 @@ class HashGridBatch(NamedTuple):
 
 
 class LossWeights(NamedTuple):
-    """What a ray's distortion loss and depth loss are multiplied by in the loss of a step; None: they are off."""
+    """What a ray's distortion loss, depth loss and opacity are multiplied by in the loss of a step; None: they are off.
+    Opacity counts where a photo shows the backdrop."""
 
     distortion: Float[Tensor, ""] | None
     depth: Float[Tensor, ""] | None
+    opacity: Float[Tensor, ""] | None
 
 
 class MicroBatch(NamedTuple):
@@ -331,8 +335,11 @@ class HashGridTrainer:
 
         distortion = self.settings.distortion_weight * distortion_multiplier(progress)
         depth = self.settings.depth_weight * depth_loss_multiplier(progress)
+        opacity = self.settings.backdrop_tolerance**2
         return LossWeights(
-            per_ray(distortion) if distortion else None, per_ray(depth) if self.has_depth_loss(progress) else None
+            per_ray(distortion) if distortion else None,
+            per_ray(depth) if self.has_depth_loss(progress) else None,
+            per_ray(opacity) if opacity else None,
         )
 
     def differentiate(
@@ -400,6 +407,10 @@ class HashGridTrainer:
             value = value + (each * depth_loss).sum()
             more_weights, more_opacity = backend.depth_loss_backward(samples, *arguments, each)
             grad_weights, grad = grad_weights + more_weights, grad._replace(opacity=grad.opacity + more_opacity)
+        if weights.opacity is not None:
+            each = weights.opacity * shows_backdrop(batch.target, batch.background, self.settings.backdrop_tolerance)
+            value = value + (each * forward_pass.rendering.opacity).sum()
+            grad = grad._replace(opacity=grad.opacity + each)
         return Loss(value, error.square().sum() / (3 * rays), grad, grad_weights, effects)
 
     def _check_finite(self, step: int, micro_batches: Sequence[MicroBatch]) -> tuple[float, float, int, int]:

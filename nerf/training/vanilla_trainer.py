@@ -15,6 +15,7 @@ from nerf.geometry.rays import Rays
 from nerf.runtime.parallel import in_order
 from nerf.runtime.profiler import WorkCounts, span
 from nerf.runtime.randomness import generator
+from nerf.training.colour_loss import shows_backdrop
 from nerf.training.learning_rate import learning_rate
 from nerf.training.pixel_sampler import PixelSampler
 from nerf.training.psnr import psnr
@@ -34,13 +35,15 @@ ADAM_BYTES = 4 * 7  # of a weight: its gradient read, itself and its moments rea
 @dataclass(frozen=True)
 class VanillaTrainerSettings:
     """How to train. ``background`` is what lies behind the scene: a colour, or another random one each step
-    (only for photos with alpha, where it shows the field which space is empty)."""
+    (only for photos with alpha, where it shows the field which space is empty). ``backdrop_tolerance``: of the one
+    colour that photos show where nothing is, in [0, 1]; 0: they show other things (nerf/training/colour_loss.py)."""
 
     batch_rays: int
     seed: int
     background: tuple[float, float, float] | Literal["random"]
     initial_learning_rate: float = 5e-4
     final_learning_rate: float = 5e-5
+    backdrop_tolerance: float = 0.0
 
 
 class Batch(NamedTuple):
@@ -132,10 +135,18 @@ class VanillaTrainer:
             residual = self.effects.residual(RenderedRays(rendering, background, rays, view), target)
             return residual.square().sum() / batch.target.numel()
 
+        def opacity_cost(rendering: Rendering) -> Float[Tensor, ""] | float:
+            tolerance = self.settings.backdrop_tolerance
+            if tolerance == 0:
+                return 0.0
+            at_backdrop = rendering.opacity * shows_backdrop(target, background, tolerance)
+            return tolerance**2 * at_backdrop.sum() / len(batch.target)
+
         with span("composite"):
             fine_error = squared_error(fine)
-            # A field without hierarchy has one rendering and counts it once.
-            loss = fine_error if coarse is fine else squared_error(coarse) + fine_error
+            loss = fine_error + opacity_cost(fine)
+            if coarse is not fine:  # a field without hierarchy has one rendering and counts it once
+                loss = squared_error(coarse) + opacity_cost(coarse) + loss
         with span("backward", self._backward_work(len(view))):
             return _Part(loss.detach(), fine_error.detach(), torch.autograd.grad(loss, self.parameters))
 

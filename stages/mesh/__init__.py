@@ -170,7 +170,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 STAGE = Stage(
     name="mesh",
     inputs=("ingest", "normalise", "scale", "train"),
-    version=24,
+    version=25,
     exit_code=17,
     published=("mesh.glb", "mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "mesh.stl", "mesh.3mf", "mesh.usdz"),
     config=Config,

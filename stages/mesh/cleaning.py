@@ -10,6 +10,7 @@ from stages.contract import StageError
 from stages.mesh.grid_space import VoxelSize
 from stages.mesh.surface import (
     Surface,
+    averaged,
     border_indices,
     border_vertices,
     components,
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 # quarter; what only shows past the edge of something else is visible in fewer (docs/experiments/mesh.md).
 MIN_VISIBLE_FRACTION = 0.2
 DILATION_STEPS = 10  # edges from a visible vertex within which faces are kept: creases and gaps close
+# The same of the mean around a vertex, that many edges far: sheets that show here and there have a seventh.
+MIN_MEAN_VISIBLE_FRACTION, AVERAGING_STEPS = 0.25, 10
 FRINGE_STEPS = 1  # edges of the decimated surface (docs/experiments/mesh.md)
 MIN_VISIBLE_AREA = 0.1  # of a component's; an inner cavity has none, the visible side of an object about half
 # Of a component's area, near a sparse point. Of the demo's table 41 % lies within 0.03 of one, 57 % within 0.05; of
@@ -75,8 +78,8 @@ def clean(
     surface, old = keep_faces(surface, inside)
     hidden = 0
     if keep == "visible":
-        visible = visibility.visible[old] >= np.maximum(min_views, MIN_VISIBLE_FRACTION * visibility.in_frustum[old])
-        remove = _hidden(surface, visible, points, has_alpha)
+        views, of = visibility.visible[old], visibility.in_frustum[old]
+        remove = _hidden(surface, np.where(views >= min_views, views / np.maximum(of, 1), 0), points, has_alpha)
         surface, left = keep_faces(surface, ~remove)
         old, hidden = old[left], int(remove.sum())
     label = components(surface)
@@ -94,23 +97,29 @@ def clean(
     return Cleaned(surface, old[left], int(good.sum()), int((~good).sum()), int((~inside).sum()), hidden)
 
 
-def _hidden(surface: Surface, visible: np.ndarray, points: np.ndarray, has_alpha: bool) -> np.ndarray:
-    """Faces without a vertex within DILATION_STEPS edges of a ``visible`` one or near a sparse point, (faces,) bool;
-    none where that would be all.
+def _hidden(surface: Surface, share: np.ndarray, points: np.ndarray, has_alpha: bool) -> np.ndarray:
+    """Faces that no photo shows to be there, (faces,) bool; none where that would be all. ``share``: of the photos
+    whose frustums hold a vertex, how many see it, (n,).
+
+    These are faces without a sparse point near that lie more than DILATION_STEPS edges from every visible vertex; and,
+    where they hang together with an open border, those around which the mean share is small: sheets of sky that show
+    here and there past the edge of a table, and end where the region does.
 
     Where there are too few points to tell (imported poses of photos with alpha have none), visibility alone decides;
     but of photos with alpha only such parts go as end openly. Their silhouettes bound an object on all sides, so that
     its bare underside closes it and stays. Without alpha the volume below a table is as the field happened to leave it.
     """
+    near, few = np.zeros(len(share), bool), len(points) < MIN_POINTS
+    if not few:
+        tree, radius = _point_tree(points)
+        near = np.isfinite(tree.query(surface.vertices, distance_upper_bound=radius)[0])
+    visible = share >= MIN_VISIBLE_FRACTION
     for _ in range(DILATION_STEPS):
         visible = _dilated(surface.faces, visible)
-    if len(points) < MIN_POINTS:
-        hidden = ~np.all(visible[surface.faces], axis=1)
-        hidden = _ends_openly(surface, hidden) if has_alpha else hidden
-    else:
-        tree, radius = _point_tree(points)
-        supported = np.isfinite(tree.query(surface.vertices, distance_upper_bound=radius)[0])
-        hidden = ~(supported | visible)[surface.faces].all(1)
+    often_visible = averaged(surface, share, AVERAGING_STEPS) >= MIN_MEAN_VISIBLE_FRACTION
+    hidden, seldom_visible = (~np.all((near | each)[surface.faces], axis=1) for each in (visible, often_visible))
+    hidden = _ends_openly(surface, hidden) if has_alpha and few else hidden
+    hidden |= _ends_openly(surface, seldom_visible)
     return hidden & ~hidden.all()
 
 

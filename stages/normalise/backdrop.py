@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from nerf.geometry.normalisation import Normalisation
-from nerf.geometry.scene import Split
+from nerf.geometry.scene import BACKDROP_TOLERANCE, Split
 from stages.contract import Progress
 from stages.io.amounts import rgb
 from stages.io.photos import Box, Photo, spread
@@ -23,9 +23,6 @@ from stages.io.pixels import box_of, load_pixels, loaders
 LONG_SIDE = 200  # pixels of a photo made small, in which a thin part still has one
 BORDER = 2  # of these pixels, at each edge
 FEW = 8  # photos, evenly spread: they can rule a backdrop out without a look at the others
-# Of 255, in each channel. Deviations spread evenly over this have a root mean square of 0.018 of the range of colours,
-# twice the MIN_EFFECT of nerf/effects/statistics/statistic.py: with more, leaving the backdrop out would be seen.
-TOLERANCE = 8
 # Of the borders of all photos: an object may reach an edge in some. The photos of scenes have at most 0.43
 # (docs/experiments/effects.md).
 MIN_SHARE = 0.9
@@ -89,7 +86,7 @@ def _border(pixels: np.ndarray) -> np.ndarray:
 
 
 def _has(colour: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    return np.all(np.abs(pixels - colour) <= TOLERANCE, axis=-1)
+    return np.all(np.abs(pixels - colour) <= BACKDROP_TOLERANCE, axis=-1)
 
 
 def _look(pixels: np.ndarray, colour: np.ndarray) -> tuple[float, Box | None]:

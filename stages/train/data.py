@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from nerf.geometry.rays import Rays, rays_of_view
+from nerf.geometry.scene import BACKDROP_TOLERANCE
 from nerf.training.ray_dataset import PosedViews, RayDataset, make_ray_dataset
 from nerf.training.trainer import composite_over
 from stages.contract import Inputs, Progress, StageError
@@ -209,6 +210,11 @@ def field_background(config: Config, scene: "Scene") -> tuple[float, float, floa
     if scene.backdrop is not None:
         return scene.backdrop
     return WHITE if scene.has_alpha and config.background != "black" else BLACK
+
+
+def backdrop_tolerance(config: Config, scene: "Scene") -> float:
+    """Within how much of the backdrop's colour a photo shows that nothing is there, of 1; 0: no photo does."""
+    return 0.0 if scene.backdrop is None or has_background_model(config, scene) else BACKDROP_TOLERANCE / 255
 
 
 def has_background_model(config: Config, scene: "Scene") -> bool:

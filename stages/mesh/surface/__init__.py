@@ -52,6 +52,19 @@ def components(surface: Surface) -> np.ndarray:
     return np.argsort(order)[label]
 
 
+def averaged(surface: Surface, values: np.ndarray, steps: int) -> np.ndarray:
+    """Values of vertices (n,), ``steps`` times the mean of a vertex's own and its neighbours'."""
+    start, end = directed_edges(surface)
+    own = np.arange(len(values))
+    rows, columns = np.concatenate([start, end, own]), np.concatenate([end, start, own])
+    neighbours = coo_matrix((np.ones(len(rows)), (rows, columns)), (len(own), len(own))).tocsr()
+    neighbours.data[:] = 1  # an edge belongs to two faces
+    count = neighbours @ np.ones(len(own))
+    for _ in range(steps):
+        values = neighbours @ values / count
+    return values
+
+
 def keep_faces(surface: Surface, keep: np.ndarray) -> tuple[Surface, np.ndarray]:
     """The faces marked in ``keep`` (m,) with the vertices they use, and the old index of each new vertex."""
     faces = surface.faces[keep]

@@ -17,7 +17,7 @@ from stages.hardware.memory import available_on
 from stages.hardware.ranks import rank_count
 from stages.io.amounts import bytes_in_words, counted, short_count
 from stages.train.config import Config
-from stages.train.data import has_background_model, training_background
+from stages.train.data import backdrop_tolerance, has_background_model, training_background
 from stages.train.fields.hash_grid_options import MAX_MICRO_BATCHES
 from stages.train.fields.space import map_without_scene, space_map_of, width_in_photos
 
@@ -278,6 +278,7 @@ def _trainer_settings(config: Config, scene: "Scene", seed: int) -> HashGridTrai
         learning_rate=config.learning_rate,
         distortion_weight=DISTORTION[_space(config)],
         depth_weight=DEPTH_LOSS,
+        backdrop_tolerance=backdrop_tolerance(config, scene),
         min_photos=MIN_PHOTOS,
         long_steps_until=LONG_STEPS_UNTIL[_space(config)] if compute_device() == "cpu" and not config.after else 0.0,
     )

@@ -9,7 +9,7 @@ from nerf.training.vanilla_trainer import CHUNK_RAYS, VanillaTrainer, VanillaTra
 from stages.contract import Progress
 from stages.hardware.device import compute_device, cores
 from stages.train.config import Config
-from stages.train.data import training_background
+from stages.train.data import backdrop_tolerance, training_background
 from stages.train.fields.space import map_without_scene, space_map_of
 
 if TYPE_CHECKING:
@@ -119,8 +119,14 @@ def make_trainer(
     """A fresh field with its trainer, where ``dataset`` is."""
     assert config.learning_rate is not None, "plan() chooses it"
     model = VanillaNerf(field_settings(config, space_map_of(config, scene)), seed).to(dataset.device)
-    rates = (config.learning_rate, config.learning_rate * FINAL_LEARNING_RATE)
-    settings = VanillaTrainerSettings(rays_per_step(config), seed, training_background(config, scene), *rates)
+    settings = VanillaTrainerSettings(
+        batch_rays=rays_per_step(config),
+        seed=seed,
+        background=training_background(config, scene),
+        initial_learning_rate=config.learning_rate,
+        final_learning_rate=config.learning_rate * FINAL_LEARNING_RATE,
+        backdrop_tolerance=backdrop_tolerance(config, scene),
+    )
     return VanillaTrainer(model, dataset, settings, effects)
 
 

@@ -33,7 +33,7 @@ from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, s
 CONTRACTED = replace(FIELD, space=Contraction(), min_step_size=0.1, cone_angle=0.2, background_model=True)
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 FORWARD = replace(FIELD, space=Ndc((0.0, 0.0, -3.0), AXES, (0.6, 0.6), 1.0), background_model=True)
-LOSSES = replace(TRAINER, distortion_weight=0.1, depth_weight=0.2)
+LOSSES = replace(TRAINER, distortion_weight=0.1, depth_weight=0.2, backdrop_tolerance=0.05)
 
 
 def trainer_on(device: str, backend: Backend, field: HashGridSettings = FIELD) -> HashGridTrainer:

@@ -73,3 +73,46 @@ def test_steps_draw_every_pixel_once_before_any_again(monkeypatch: pytest.Monkey
     often = torch.cat(drawn).bincount(minlength=512)
     assert len(rays) > 5 and often.sum() == run.pixels_sampled > 1024
     assert often.max() - often.min() <= 1
+
+
+BEFORE_GREY = replace(TRAINER, background=(128 / 255, 128 / 255, 128 / 255))
+
+
+def before_grey() -> tuple[RayDataset, Tensor]:
+    """A red disc before grey, from both sides, without alpha; and which pixels are grey."""
+    dataset = small_dataset()
+    plain = dataset.pixels[:, 3] == 0
+    pixels = torch.where(plain[:, None], torch.full((3,), 128, dtype=torch.uint8), dataset.pixels[:, :3])
+    return dataset._replace(pixels=pixels), plain
+
+
+def before_backdrop(tolerance: float) -> HashGridTrainer:
+    settings = replace(BEFORE_GREY, backdrop_tolerance=tolerance)
+    return HashGridTrainer(HashGridField(FIELD, 0, reference), before_grey()[0], settings)
+
+
+def test_opacity_costs_the_squared_tolerance_before_a_backdrop() -> None:
+    free, costly = before_backdrop(0.0), before_backdrop(0.1)
+    batch = free.draw_batch(0, 0.0, 0, 64)
+    done = free.model.forward(batch.rays, batch.jitter, batch.thinning_offset, batch.background)
+    losses = [run._loss(64, run.loss_weights(64, 0.0), done, batch) for run in (free, costly)]
+    plain = (batch.target == batch.background).all(1)
+    assert 0 < plain.float().mean() < 1 and done.rendering.opacity[plain].sum() > 0
+    torch.testing.assert_close(losses[1].grad.opacity - losses[0].grad.opacity, 0.1**2 / 64 * plain)
+    expected = float(0.1**2 / 64 * done.rendering.opacity[plain].sum())
+    assert float(losses[1].value - losses[0].value) == pytest.approx(expected, rel=1e-3)
+    assert losses[0].squared_error == losses[1].squared_error, "what it costs is no error of colours"
+
+
+def test_grey_lumps_before_grey_fade_and_the_object_stays() -> None:
+    photos, plain = before_grey()
+    rays, colour = photos.lookup(torch.arange(len(plain)))[:2]
+    opacity = []
+    for tolerance in (0.0, 8 / 255):
+        run = before_backdrop(tolerance)
+        for step in range(200):
+            run.step(step, step / 200)
+        seen = run.model.render(rays, run.fixed_background)
+        opacity.append((float(seen.opacity[plain].mean()), float(seen.opacity[~plain].mean())))
+        assert (seen.colour - colour).square().mean() < 1e-4
+    assert opacity[1][0] < 0.1 * opacity[0][0] and opacity[1][1] > 0.8

@@ -183,3 +183,15 @@ def test_per_image_parameters_are_trained_and_resumed() -> None:
     moved = {name: (part.detach() - begun[name]).abs().max() for name, part in whole.effects.parameters.items()}
     assert set(moved) == {"pose_refinement.turn", "pose_refinement.offset", "exposure.log_gain"}
     assert all(1e-4 < change < 0.2 for change in moved.values())
+
+
+def test_white_matter_before_white_fades() -> None:
+    photos, left = small_dataset(), []
+    rays, colour = photos.lookup(torch.arange(288))[:2]
+    for tolerance in (0.0, 0.3):
+        run = trainer(replace(TRAINER, backdrop_tolerance=tolerance), photos)
+        for step in range(300):
+            run.step(step, step / 300)
+        seen = run.model.render(rays, torch.ones(3))
+        left.append(float(seen.opacity[colour.amin(1) == 1].mean()))
+    assert left[1] < left[0] / 2

@@ -8,11 +8,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerf.fields.hash_grid import HashGridSettings
-from nerf.geometry.scene import Camera, Scene
+from nerf.geometry.scene import BACKDROP_TOLERANCE, Camera, Scene
 from stages.contract import Progress
 from stages.effects.decisions import Decisions, Space
 from stages.train import Config
-from stages.train.data import MIN_LONG_SIDE, field_background, has_background_model, scaled_size, training_background
+from stages.train.data import (
+    MIN_LONG_SIDE,
+    backdrop_tolerance,
+    field_background,
+    has_background_model,
+    scaled_size,
+    training_background,
+)
 from stages.train.fields.field_list import with_defaults
 from stages.train.fields.hash_grid import (
     LARGE_STEP_LEARNING_RATE,
@@ -229,6 +236,16 @@ def test_an_empty_field_shows_the_backdrop(scene: Scene, field: Config) -> None:
     before = replace(scene, has_alpha=False, backdrop=(1.0, 0.5, 0.0))
     assert field_background(field, before) == training_background(field, before) == (1.0, 0.5, 0.0)
     assert field_background(field, replace(before, backdrop=None)) == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("field", [GRID, VANILLA])
+def test_a_backdrop_that_is_modelled_tells_nothing_of_opacity(scene: Scene, field: Config) -> None:
+    before = replace(scene, has_alpha=False, backdrop=(1.0, 0.5, 0.0))
+    tolerances = [
+        backdrop_tolerance(field.model_copy(update={"space": space}), before) for space in ("bounded", "contracted")
+    ]
+    assert tolerances == [BACKDROP_TOLERANCE / 255, 0]
+    assert backdrop_tolerance(field, replace(before, backdrop=None)) == 0
 
 
 def test_the_reason_for_sizes_is_the_budget() -> None:
