@@ -10,13 +10,13 @@ from stages.contract import StageError
 from stages.mesh.grid_space import VoxelSize
 from stages.mesh.surface import (
     Surface,
-    averaged,
     border_indices,
     border_vertices,
     components,
     face_areas,
     is_watertight,
     keep_faces,
+    neighbour_means,
 )
 from stages.mesh.visibility import Visibility
 
@@ -116,7 +116,10 @@ def _hidden(surface: Surface, share: np.ndarray, points: np.ndarray, has_alpha: 
     visible = share >= MIN_VISIBLE_FRACTION
     for _ in range(DILATION_STEPS):
         visible = _dilated(surface.faces, visible)
-    often_visible = averaged(surface, share, AVERAGING_STEPS) >= MIN_MEAN_VISIBLE_FRACTION
+    means = neighbour_means(surface)
+    for _ in range(AVERAGING_STEPS):
+        share = means @ share
+    often_visible = share >= MIN_MEAN_VISIBLE_FRACTION
     hidden, seldom_visible = (~np.all((near | each)[surface.faces], axis=1) for each in (visible, often_visible))
     hidden = _ends_openly(surface, hidden) if has_alpha and few else hidden
     hidden |= _ends_openly(surface, seldom_visible)

@@ -18,7 +18,7 @@ from nerf.runtime.parallel import in_order
 from stages.mesh.grid_space import VoxelLengths
 from stages.mesh.photos.photo import Photo, Projection, photos_of, projected, unmasked
 from stages.mesh.rasteriser import nearest_faces
-from stages.mesh.surface import Surface, vertex_normals
+from stages.mesh.surface import Surface, neighbour_means, vertex_normals
 
 KEPT_PHOTOS = 12  # per vertex, the best ones: what is in memory does not grow with the number of photos
 MAX_MAP_SIDE = 400  # pixels of a depth map
@@ -34,7 +34,7 @@ NORMAL_STEPS = 3  # over neighbours
 class BestPhotos(NamedTuple):
     """The best ``photos`` of each vertex, (n, KEPT_PHOTOS): their ``number``, their sharp ``pixels`` per unit of area,
     their ``quality`` (these, less where a photo tells less; 0: none) and whether they show the surface ``whole``:
-    nothing nearer or farther within a voxel of the vertex. ``means``: :func:`neighbour_means`."""
+    nothing nearer or farther within a voxel of the vertex. ``means``: :func:`stages.mesh.surface.neighbour_means`."""
 
     photos: list[Photo]
     means: csr_array
@@ -63,18 +63,6 @@ class Sight(NamedTuple):
     pixels: np.ndarray
     quality: np.ndarray
     whole: np.ndarray
-
-
-def neighbour_means(surface: Surface) -> csr_array:
-    """The matrix that takes the mean of each vertex and its neighbours, (n, n) float32."""
-    count = len(surface.vertices)
-    edges = np.concatenate([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]], surface.faces[:, [2, 0]]])
-    row, column = np.concatenate([edges, edges[:, ::-1], np.arange(count)[:, None].repeat(2, axis=1)]).T
-    means = csr_array((np.ones(len(row), np.float32), (row, column)), (count, count))
-    means.sum_duplicates()
-    length = np.diff(means.indptr)
-    means.data[:] = np.repeat(1 / length, length)
-    return means
 
 
 def smooth_normals(surface: Surface, means: csr_array) -> np.ndarray:

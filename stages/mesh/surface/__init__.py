@@ -7,7 +7,7 @@ the side of lower density.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_array
 from scipy.sparse.csgraph import connected_components
 
 
@@ -52,17 +52,16 @@ def components(surface: Surface) -> np.ndarray:
     return np.argsort(order)[label]
 
 
-def averaged(surface: Surface, values: np.ndarray, steps: int) -> np.ndarray:
-    """Values of vertices (n,), ``steps`` times the mean of a vertex's own and its neighbours'."""
-    start, end = directed_edges(surface)
-    own = np.arange(len(values))
-    rows, columns = np.concatenate([start, end, own]), np.concatenate([end, start, own])
-    neighbours = coo_matrix((np.ones(len(rows)), (rows, columns)), (len(own), len(own))).tocsr()
-    neighbours.data[:] = 1  # an edge belongs to two faces
-    count = neighbours @ np.ones(len(own))
-    for _ in range(steps):
-        values = neighbours @ values / count
-    return values
+def neighbour_means(surface: Surface) -> csr_array:
+    """The matrix that takes the mean of each vertex and its neighbours, (n, n) float32."""
+    count = len(surface.vertices)
+    edges = np.concatenate([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]], surface.faces[:, [2, 0]]])
+    row, column = np.concatenate([edges, edges[:, ::-1], np.arange(count)[:, None].repeat(2, axis=1)]).T
+    means = csr_array((np.ones(len(row), np.float32), (row, column)), (count, count))
+    means.sum_duplicates()
+    length = np.diff(means.indptr)
+    means.data[:] = np.repeat(1 / length, length)
+    return means
 
 
 def keep_faces(surface: Surface, keep: np.ndarray) -> tuple[Surface, np.ndarray]:
