@@ -71,6 +71,7 @@ class Config(StageConfig):
         ),
     )
     refine: bool = Field(default=True, description="Move the surface to where the photos agree that it is.")
+    smooth: bool = Field(default=False, description="Smooth the faces, and keep edges.")
     close: float = Field(
         default=0.0,
         ge=0,

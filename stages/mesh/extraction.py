@@ -40,6 +40,7 @@ from stages.mesh.resolution import CHUNK, grid_box, point_cost, slab_factor
 from stages.mesh.surface import Surface, components, face_areas, is_watertight, keep_faces, vertex_normals
 from stages.mesh.surface.decimation import decimate
 from stages.mesh.surface.holes import Closed, close_holes
+from stages.mesh.surface.smoothing import smoothed
 from stages.mesh.texture.texturing import Textured, texture_of
 from stages.mesh.visibility import ShadowMap, sample_rays, shadow_maps, vertex_visibility
 from stages.scale import metres_per_unit
@@ -132,6 +133,7 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     seen, best_photos = _seen_part(config, decimated, source, voxel_size, progress)
     ends = boundary(seen, extent, voxel_size, cropped=len(cropped.faces) < len(cleaned.surface.faces))
     surface, refined = _refined(config, seen, best_photos, voxel_size, progress)
+    surface = smoothed(surface) if config.smooth else surface
     if config.close:
         surface, closed = close_holes(surface, config.close)
         ends = "watertight" if is_watertight(surface) else ends

@@ -52,6 +52,21 @@ def components(surface: Surface) -> np.ndarray:
     return np.argsort(order)[label]
 
 
+def face_neighbours(faces: np.ndarray) -> np.ndarray:
+    """Pairs of faces (pairs, 2) that share an edge; of an edge with more than two faces each with the next."""
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).astype(np.int64)
+    key = edges[:, 0] * (int(faces.max(initial=0)) + 1) + edges[:, 1]
+    order = np.argsort(key, kind="stable")
+    same = np.flatnonzero(key[order][1:] == key[order][:-1])
+    return np.stack([order[same], order[same + 1]], axis=1) // 3
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (n, 3) of length one; those without length stay so."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+
+
 def neighbour_means(surface: Surface) -> csr_array:
     """The matrix that takes the mean of each vertex and its neighbours, (n, n) float32."""
     count = len(surface.vertices)

@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from stages.mesh.rasteriser import covered_pixels
-from stages.mesh.surface import Surface, face_area_vectors
+from stages.mesh.surface import Surface, face_area_vectors, face_neighbours, unit
 
 SMOOTHING_STEPS = 12  # of the faces' normals over their neighbours, before a direction is chosen for each
 MIN_COSINE = 0.5  # between a face and the direction of its chart: it has at least half of its area there
@@ -38,7 +38,7 @@ def cut_into_charts(surface: Surface) -> Charts:
     """Charts of a surface; within one, faces that overlap share no more than edges. Faces without area are points or
     lines in theirs."""
     neighbours = face_neighbours(surface.faces)
-    normals = _unit(face_area_vectors(*surface))
+    normals = unit(face_area_vectors(*surface))
     direction = _chosen_directions(surface, neighbours, normals)
     corners = _flattened(surface, direction)
     chart = _connected(neighbours, direction)
@@ -53,20 +53,6 @@ def cut_into_charts(surface: Surface) -> Charts:
     return Charts(chart, corners)
 
 
-def face_neighbours(faces: np.ndarray) -> np.ndarray:
-    """Pairs of faces (pairs, 2) that share an edge; of an edge with more than two faces each with the next."""
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).astype(np.int64)
-    key = edges[:, 0] * (int(faces.max(initial=0)) + 1) + edges[:, 1]
-    order = np.argsort(key, kind="stable")
-    same = np.flatnonzero(key[order][1:] == key[order][:-1])
-    return np.stack([order[same], order[same + 1]], axis=1) // 3
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
-
-
 def _chosen_directions(surface: Surface, neighbours: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Which of DIRECTIONS each face's chart looks along, (faces,): the one nearest to its smoothed normal, so that
     charts are large, among those that it faces itself."""
@@ -76,7 +62,7 @@ def _chosen_directions(surface: Surface, neighbours: np.ndarray, normals: np.nda
     for _ in range(SMOOTHING_STEPS):
         smooth = mean @ smooth
     cosine = np.where((normals == 0).all(axis=1)[:, None], 1.0, normals @ DIRECTIONS.T)
-    direction = np.where(cosine >= MIN_COSINE, _unit(smooth) @ DIRECTIONS.T, -2.0).argmax(axis=1)
+    direction = np.where(cosine >= MIN_COSINE, unit(smooth) @ DIRECTIONS.T, -2.0).argmax(axis=1)
     allowed = cosine >= MIN_JOINED_COSINE
     for _ in range(MERGING_STEPS):
         direction = _joined(neighbours, direction, allowed)
@@ -111,7 +97,7 @@ def _connected(neighbours: np.ndarray, label: np.ndarray) -> np.ndarray:
 def _flattened(surface: Surface, direction: np.ndarray) -> np.ndarray:
     """The faces in the planes that their directions look along, counter-clockwise, (faces, 3, 2)."""
     aside = np.where(np.abs(DIRECTIONS[:, 2:]) > 0.9, [[1.0, 0, 0]], [[0.0, 0, 1]])
-    across = _unit(np.cross(aside, DIRECTIONS))
+    across = unit(np.cross(aside, DIRECTIONS))
     axes = np.stack([across, np.cross(DIRECTIONS, across)], axis=2)  # (directions, 3, 2)
     return np.einsum("fij,fjk->fik", surface.vertices[surface.faces], axes[direction])
 

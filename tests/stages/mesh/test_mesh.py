@@ -240,6 +240,16 @@ def test_equal_inputs_give_equal_bytes(run_mesh):
     assert results[0][0] == results[1][0]
 
 
+def test_faces_are_smoothed_where_asked_for(run_mesh):
+    rough, smooth = (
+        trimesh.load_mesh(run_mesh(Solid(ball), folder=str(asked), smooth=asked)[1] / "mesh.ply", process=False)
+        for asked in (False, True)
+    )
+    np.testing.assert_array_equal(rough.faces, smooth.faces)
+    apart = np.linalg.norm(rough.vertices - smooth.vertices, axis=1)
+    assert 0 < apart.max() < VOXEL / 0.25
+
+
 def test_specks_and_cavities_are_dropped(run_mesh):
     result, folder = run_mesh(Solid(hollow_ball_and_speck), min_component=0.05)
     assert result.line.endswith("1 component, watertight")
