@@ -116,7 +116,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 STAGE = Stage(
     name="effects",
     inputs=("ingest", "sfm", "normalise"),
-    version=21,
+    version=22,
     exit_code=13,
     published=("effects.json",),
     config=Config,

@@ -28,14 +28,14 @@ class EffectParts(NamedTuple):
 
 class Effect(NamedTuple):
     """``load`` imports its parts, which need torch. ``part_of_the_method``: the published method has it, so it is left
-    out only where that gains; others are added only where that does. ``only_by_pilot``: its statistic can rule it out,
-    but something else may look like it: only an A/B run turns it on."""
+    out only where that gains; others are added only where that does. ``has_lookalike``: something else
+    may look like it, so that where its statistic is clear an A/B run may still speak against it."""
 
     name: str
     description: str
     load: Callable[[], EffectParts]
     part_of_the_method: bool = False
-    only_by_pilot: bool = False
+    has_lookalike: bool = False
 
 
 def _background() -> EffectParts:
@@ -78,7 +78,7 @@ EFFECTS = [
     # Poses before the others: there are two A/B runs, and wrong poses cost more.
     Effect("pose_refinement", "a rigid correction of each photo's camera", _pose_refinement),
     # Corners may lie in the dark: on fountain_p11 a part of what the statistic sees is light (docs/experiments).
-    Effect("vignetting", "less light towards the corners of each camera", _vignetting, only_by_pilot=True),
+    Effect("vignetting", "less light towards the corners of each camera", _vignetting, has_lookalike=True),
     Effect(
         "view_dependence", "colour that depends on the viewing direction", _view_dependence, part_of_the_method=True
     ),

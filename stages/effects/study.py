@@ -143,20 +143,20 @@ class _Study:
 
     def _verdict(self, effect: Effect, off: Decisions, on: Decisions) -> Verdict:
         asked = self.config.force.get(effect.name)
-        statistic, default = self.found.of[effect.name], effect.part_of_the_method
+        statistic = self.found.of[effect.name]
         if asked is not None:
             return Verdict(asked == "on", f"asked for; {statistic.words}")
+        clear, words = statistic.called_for, statistic.words
+        default = effect.part_of_the_method or (effect.has_lookalike and clear is True)
         # Highlights have no tracks: what is seen of view dependence is a lower bound, and too little of it no proof.
-        unproven = (default and statistic.called_for is False) or (
-            effect.only_by_pilot and statistic.called_for is True
-        )
-        if statistic.called_for is not None and not unproven:
-            return Verdict(statistic.called_for, statistic.words)
+        proves_nothing = (effect.has_lookalike and clear is True) or (effect.part_of_the_method and clear is False)
+        if clear is not None and not proves_nothing:
+            return Verdict(clear, words)
         if math.isinf(statistic.noise):
-            return Verdict(default, statistic.words)
+            return Verdict(default, words)
         if why := self._why_no_pilot(off, on):
-            return Verdict(default, f"{statistic.words}; unclear, and no A/B run: {why}")
-        return self._piloted(effect, off, on)
+            return Verdict(default, f"{words}; {'unclear, and ' if clear is None else ''}no A/B run: {why}")
+        return self._piloted(effect, off, on, default)
 
     def _why_no_pilot(self, off: Decisions, on: Decisions) -> str | None:
         if not self.config.pilot_steps:
@@ -169,16 +169,16 @@ class _Study:
             self.trial = ab_runs.pilot_scene(self.inputs, self.scene, self.progress)
         return self.trial if isinstance(self.trial, str) else None
 
-    def _piloted(self, effect: Effect, off: Decisions, on: Decisions) -> Verdict:
+    def _piloted(self, effect: Effect, off: Decisions, on: Decisions, default: bool) -> Verdict:
         assert self.trial is not None and not isinstance(self.trial, str), "a reason against pilots is heard before"
         self.pilots += 1
         self.fitting_pilots += fits_poses(off, on)
-        words, default = self.found.of[effect.name].words, effect.part_of_the_method
+        words = self.found.of[effect.name].words
         try:
             steps, seed = self.config.pilot_steps, self.config.seed
             pilot = ab_runs.run_pilot(self.trial, off, on, steps, seed, self.progress, default)
         except NonFinite as fault:
-            return Verdict(default, f"{words}; unclear, and the A/B run diverged: {fault}")
+            return Verdict(default, f"{words}; the A/B run diverged: {fault}")
         seeds = "" if pilot.seeds == ab_runs.SEEDS else f" with {pilot.seeds} of {ab_runs.SEEDS} seeds"
         gain = f"an A/B run gained {pilot.gain_db:+.2f} ± {pilot.noise_db:.2f} dB{seeds}"
         stays = not pilot.hurts if default else pilot.pays

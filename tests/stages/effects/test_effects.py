@@ -137,7 +137,7 @@ def test_a_diverging_pilot_leaves_the_effect(decided: Callable) -> None:
 
     decisions, table, *_ = decided(effects.Config(), 1.0, diverging, exposure=found(None))
     assert "exposure" not in decisions.on
-    assert table["exposure"]["reason"].endswith("unclear, and the A/B run diverged: the loss of step 3 is not finite")
+    assert table["exposure"]["reason"].endswith("the A/B run diverged: the loss of step 3 is not finite")
 
 
 def test_without_pilots_the_grey_zone_follows_publication(decided: Callable) -> None:
@@ -192,7 +192,7 @@ def test_decisions_are_read_as_they_were_written(tmp_path: Path) -> None:
     ("made", "on"),
     [
         (Effects(exposure_ev=1.0), {"background", "exposure", "view_dependence"}),
-        (Effects(vignetting_ev=1.0), {"background", "view_dependence"}),  # clear, but only an A/B run turns it on
+        (Effects(vignetting_ev=1.0), {"background", "view_dependence", "vignetting"}),
         (Effects(highlight=1.0, alpha=True), {"view_dependence"}),
     ],
 )
@@ -207,9 +207,13 @@ def test_real_evidence_of_a_synthetic_scene(tmp_path: Path, made: Effects, on: s
     assert (table["vignetting"]["statistic"] > table["vignetting"]["threshold"]) == bool(made.vignetting_ev)
 
 
-@pytest.mark.parametrize(("gain", "on"), [(0.6, True), (-0.5, False)])
-def test_clear_vignetting_is_left_to_a_pilot(decided: Callable, gain: float, on: bool) -> None:
-    decisions, table, _, tried = decided(effects.Config(), gain, vignetting=found(True))
+@pytest.mark.parametrize(
+    ("clear", "gain", "on"), [(True, 0.6, True), (True, 0.0, True), (True, -0.5, False), (None, 0.0, False)]
+)
+def test_a_pilot_may_speak_against_clear_vignetting(
+    decided: Callable, clear: bool | None, gain: float, on: bool
+) -> None:
+    decisions, table, _, tried = decided(effects.Config(), gain, vignetting=found(clear))
     assert tried == ["vignetting"] and ("vignetting" in decisions.on) == table["vignetting"]["on"] == on
 
 
