@@ -36,8 +36,10 @@ MAX_STEP_SAMPLES, LARGE_STEP_LEARNING_RATE = 1 << 18, 2e-2
 # Weight of the distortion loss (Barron et al. 2022, who take 1e-2 where distances go from 0 to 1, as about they do in
 # normalised device coordinates), against floaters, most of all close before the cameras; they also cost
 # most of the time (docs/experiments/distortion_loss.md, docs/experiments/forward_facing.md). A box around an object
-# needs none.
+# needs none where alpha says which rays are opaque; before a backdrop an object has pits without it
+# (docs/experiments/effects.md).
 DISTORTION = {"bounded": 0.0, "contracted": 2e-3, "ndc": 1e-2}
+BACKDROP_DISTORTION = 1e-2
 # Weight at first of the loss at sparse points (docs/experiments/sparse_depth.md; Deng et al. 2022 take 0.1, too, of
 # another loss).
 DEPTH_LOSS = 0.1
@@ -270,15 +272,16 @@ def _steps_across(max_res: int) -> float:
 def _trainer_settings(config: Config, scene: "Scene", seed: int) -> HashGridTrainerSettings:
     grid = config.grid
     assert grid.target_samples and grid.micro_batches and config.learning_rate, "plan() chooses them"
+    tolerance = backdrop_tolerance(config, scene)
     return HashGridTrainerSettings(
         seed=seed,
         background=training_background(config, scene),
         target_samples=grid.target_samples,
         micro_batches=grid.micro_batches,
         learning_rate=config.learning_rate,
-        distortion_weight=DISTORTION[_space(config)],
+        distortion_weight=BACKDROP_DISTORTION if tolerance else DISTORTION[_space(config)],
         depth_weight=DEPTH_LOSS,
-        backdrop_tolerance=backdrop_tolerance(config, scene),
+        backdrop_tolerance=tolerance,
         min_photos=MIN_PHOTOS,
         long_steps_until=LONG_STEPS_UNTIL[_space(config)] if compute_device() == "cpu" and not config.after else 0.0,
     )

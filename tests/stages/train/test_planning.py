@@ -22,9 +22,12 @@ from stages.train.data import (
 )
 from stages.train.fields.field_list import with_defaults
 from stages.train.fields.hash_grid import (
+    BACKDROP_DISTORTION,
+    DISTORTION,
     LARGE_STEP_LEARNING_RATE,
     MAX_STEP_SAMPLES,
     MICRO_BATCH_SAMPLES,
+    _trainer_settings,
     field_settings,
     memory_bytes,
     with_sizes,
@@ -246,6 +249,16 @@ def test_a_backdrop_that_is_modelled_tells_nothing_of_opacity(scene: Scene, fiel
     ]
     assert tolerances == [BACKDROP_TOLERANCE / 255, 0]
     assert backdrop_tolerance(field, replace(before, backdrop=None)) == 0
+
+
+def test_matter_is_compact_before_a_backdrop_and_where_space_goes_on(scene: Scene) -> None:
+    before = replace(scene, has_alpha=False, backdrop=(1.0, 0.5, 0.0))
+    cases = {"backdrop": (before, "bounded"), "alpha": (scene, "bounded"), "modelled": (before, "contracted")}
+    weights = {
+        name: _trainer_settings(with_defaults(GRID.model_copy(update={"space": space})), photos, 0).distortion_weight
+        for name, (photos, space) in cases.items()
+    }
+    assert weights == {"backdrop": BACKDROP_DISTORTION, "alpha": 0, "modelled": DISTORTION["contracted"]}
 
 
 def test_the_reason_for_sizes_is_the_budget() -> None:
