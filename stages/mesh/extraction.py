@@ -25,11 +25,13 @@ from stages.mesh.face_count import default_faces
 from stages.mesh.files import WRITERS, Z_UP_TO_Y_UP, ColouredMesh
 from stages.mesh.grid_space import (
     DensityIn,
+    GridSpace,
     VoxelSize,
     box_in,
     grid_space,
     in_scene,
     points_of_grid,
+    to_scene,
 )
 from stages.mesh.iso_level import DIVERGED_HINT, IsoLevel, check_range, choose_iso_level
 from stages.mesh.marching_cubes import extract_surface
@@ -42,7 +44,7 @@ from stages.mesh.surface.decimation import decimate
 from stages.mesh.surface.holes import Closed, close_holes
 from stages.mesh.surface.smoothing import smoothed
 from stages.mesh.texture.texturing import Textured, texture_of
-from stages.mesh.visibility import ShadowMap, sample_rays, shadow_maps, vertex_visibility
+from stages.mesh.visibility import ShadowMap, sample_rays, seen_share, shadow_maps, vertex_visibility
 from stages.scale import metres_per_unit
 
 if TYPE_CHECKING:
@@ -121,7 +123,7 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     )
     iso_level = _iso_level(config, grid, field, maps, progress)
     progress.update("marching cubes", 0.5)
-    raw = in_scene(extract_surface(grid, iso_level.density), space, region)
+    raw = in_scene(_raw_surface(config, grid, iso_level, space, maps), space, region)
     visibility = vertex_visibility(raw.vertices, vertex_normals(raw), maps, voxel_size.at(raw.vertices).along)
     progress.update("cleaning", 0.55)
     min_views = min(config.min_views, len(views))
@@ -157,6 +159,17 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     parts = int(components(surface).max()) + 1
     fringes = len(decimated.faces) - len(seen.faces)
     return Extracted(mesh, parts, iso_level, cleaned, fringes, refined, closed, ends, voxel, textured)
+
+
+def _raw_surface(
+    config: "Config", grid: DensityGrid, iso_level: IsoLevel, space: GridSpace, maps: list[ShadowMap]
+) -> Surface:
+    """In the grid's space; of cavities only where everything is asked for."""
+
+    def seen(points: np.ndarray) -> np.ndarray:
+        return seen_share(to_scene(points, space), maps)
+
+    return extract_surface(grid, iso_level.density, seen if config.keep == "visible" else None)
 
 
 def _decimated(config: "Config", surface: Surface, space: SpaceMap) -> Surface:

@@ -100,12 +100,17 @@ def points_of_grid(space: GridSpace, box: np.ndarray, resolution: int, points: n
     return x, y, z
 
 
+def to_scene(points: np.ndarray, space: GridSpace) -> np.ndarray:
+    """Points (n, 3) of the grid's space in the scene."""
+    return points if isinstance(space, Box) else space.inverse(torch.from_numpy(points)).numpy()
+
+
 def in_scene(surface: Surface, space: GridSpace, region: np.ndarray) -> Surface:
     """A surface of the grid's space with its vertices in the scene, as far as it lies in the ``region`` (2, 3). Raises
     StageError where nothing does."""
     if isinstance(space, Box):
         return surface
-    vertices = space.inverse(torch.from_numpy(surface.vertices)).numpy()
+    vertices = to_scene(surface.vertices, space)
     inside = ((vertices >= region[0]) & (vertices <= region[1])).all(axis=1)[surface.faces].all(axis=1)
     if not inside.any():
         why = "all of it is nearer, farther or more to the side"

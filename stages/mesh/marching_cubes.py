@@ -1,11 +1,14 @@
 """Marching cubes: the surface where a density grid reaches the iso-level."""
 
+from collections.abc import Callable
+
 import numpy as np
 from skimage.measure import marching_cubes
 
 from nerf.fields.density_grid import DensityGrid, occupancy, smoothed
 from stages.contract import StageError
 from stages.mesh.surface import Surface
+from stages.mesh.surface.cavities import fill_cavities
 
 # Passes of nerf.fields.density_grid.smoothed: a Gaussian of one grid spacing. The field's finest cells are about as
 # small, and what differs between two of them is noise that a grid would pick at random (docs/experiments/mesh.md).
@@ -17,8 +20,11 @@ def smoothed_occupancy(grid: DensityGrid, iso_level: float) -> DensityGrid:
     return smoothed(occupancy(grid, iso_level), SMOOTHING_PASSES)
 
 
-def extract_surface(grid: DensityGrid, iso_level: float) -> Surface:
-    """The surface at density ``iso_level`` (marching cubes, Lewiner et al. 2003); open where the box cuts it.
+def extract_surface(
+    grid: DensityGrid, iso_level: float, seen: Callable[[np.ndarray], np.ndarray] | None = None
+) -> Surface:
+    """The surface at density ``iso_level`` (marching cubes, Lewiner et al. 2003); open where the box cuts it. ``seen``,
+    the share of photos that see points of the grid's space (n, 3): no surface of cavities, where these are few.
 
     Raises StageError where no point is that dense, or all are. Smoothing leaves nothing of sheets one grid point thick
     and of rods two grid points thick.
@@ -32,6 +38,8 @@ def extract_surface(grid: DensityGrid, iso_level: float) -> Surface:
             "scene is too thin for the grid, or fills the box",
             "Give a higher --mesh.resolution or another --mesh.iso-level.",
         )
+    low, spacing = grid.low.cpu().double().numpy(), grid.spacing().cpu().double().numpy()
+    if seen is not None:
+        fill_cavities(values, lambda index: seen(low + index * spacing))
     index, faces, _, _ = marching_cubes(values, 0.5, gradient_direction="ascent")
-    vertices = grid.low.cpu().double().numpy() + index * grid.spacing().cpu().double().numpy()
-    return Surface(vertices, faces.astype(np.int32))
+    return Surface(low + index * spacing, faces.astype(np.int32))

@@ -121,6 +121,15 @@ def vertex_visibility(
     return Visibility(*map(np.concatenate, zip(*chunks, strict=True)))
 
 
+def seen_share(points: np.ndarray, maps: Sequence[ShadowMap]) -> np.ndarray:
+    """Of the photos whose frustums hold each point (n, 3), the share whose rays reach it; 0 where there are none."""
+    in_frustum, seen = np.zeros(len(points)), np.zeros(len(points))
+    for inside, sight in in_order(lambda shadow_map: _sight(points, shadow_map), maps, torch.device("cpu")):
+        in_frustum[inside] += 1
+        seen[inside] += sight.distance <= sight.depth
+    return seen / np.maximum(in_frustum, 1)
+
+
 def _chunk_visibility(
     vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxels: np.ndarray
 ) -> Visibility:
@@ -128,20 +137,34 @@ def _chunk_visibility(
     visible = np.zeros(len(vertices), np.int32)
     total = np.zeros_like(vertices)
     for shadow_map in maps:
-        offset = vertices - shadow_map.view.scene_from_camera[:, 3]
-        distance = np.linalg.norm(offset, axis=1)
-        cell = _cells(offset, shadow_map)
-        inside = np.flatnonzero((cell >= 0) & (distance >= shadow_map.view.near) & (distance <= shadow_map.view.far))
+        inside, (direction, distance, depth) = _sight(vertices, shadow_map)
         in_frustum[inside] += 1
-        direction = offset[inside] / distance[inside, None]
         cosine = -(direction * normals[inside]).sum(axis=1)
-        max_distance = shadow_map.depth.reshape(-1)[cell[inside]] + DEPTH_BIAS_VOXELS * voxels[inside]
-        sees = (cosine > MIN_COSINE) & (distance[inside] <= max_distance)
+        sees = (cosine > MIN_COSINE) & (distance <= depth + DEPTH_BIAS_VOXELS * voxels[inside])
         visible[inside[sees]] += 1
         total[inside[sees]] += direction[sees] * cosine[sees, None]
     length = np.linalg.norm(total, axis=1, keepdims=True)
     direction = np.where(length > 0, total / np.where(length > 0, length, 1), -normals)
     return Visibility(in_frustum, visible, direction)
+
+
+class _Sight(NamedTuple):
+    """Of the points in a photo's frustum: unit vectors from its camera to them (n, 3), how far they are (n,), and at
+    which distance the rays there lose half of their transmittance (n,)."""
+
+    direction: np.ndarray
+    distance: np.ndarray
+    depth: np.ndarray
+
+
+def _sight(points: np.ndarray, shadow_map: ShadowMap) -> tuple[np.ndarray, _Sight]:
+    """Which points lie in the frustum, as indices, and what is known of them."""
+    offset = points - shadow_map.view.scene_from_camera[:, 3]
+    distance = np.linalg.norm(offset, axis=1)
+    cell = _cells(offset, shadow_map)
+    inside = np.flatnonzero((cell >= 0) & (distance >= shadow_map.view.near) & (distance <= shadow_map.view.far))
+    distance = distance[inside]
+    return inside, _Sight(offset[inside] / distance[:, None], distance, shadow_map.depth.reshape(-1)[cell[inside]])
 
 
 def _cells(offset: np.ndarray, shadow_map: ShadowMap) -> np.ndarray:
