@@ -251,7 +251,7 @@ def test_a_backdrop_that_is_modelled_tells_nothing_of_opacity(scene: Scene, fiel
     assert backdrop_tolerance(field, replace(before, backdrop=None)) == 0
 
 
-def test_matter_is_compact_before_a_backdrop_and_where_space_goes_on(scene: Scene) -> None:
+def test_matter_is_compact_except_where_alpha_shows_it(scene: Scene) -> None:
     before = replace(scene, has_alpha=False, backdrop=(1.0, 0.5, 0.0))
     cases = {"backdrop": (before, "bounded"), "alpha": (scene, "bounded"), "modelled": (before, "contracted")}
     weights = {
