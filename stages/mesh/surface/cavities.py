@@ -12,8 +12,8 @@ import numpy as np
 from scipy.ndimage import label
 
 RADIUS = 3  # grid points: pits that led into a cavity were four to six wide (docs/experiments/mesh.md)
-CORNERS = 8  # grid points, from a cavity on, into corners where no cube fits
-MAX_SEEN = 0.2  # of the photos that look there; more see a room from inside, which is no cavity
+CORNERS = 3  # grid points, from a cavity on, into corners where no cube fits
+MAX_SEEN = 0.1  # of the photos that look there; more see a room from inside, which is no cavity
 SAMPLES = 20_000  # of the grid points in question, evenly spread, for which photos are asked
 
 

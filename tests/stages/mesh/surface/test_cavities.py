@@ -38,7 +38,7 @@ def test_space_behind_a_wide_gap_stays():
     np.testing.assert_array_equal(occupancy, shell(10))
 
 
-@pytest.mark.parametrize(("share", "filled"), [(0.1, True), (0.5, False)])
+@pytest.mark.parametrize(("share", "filled"), [(0.05, True), (0.5, False)])
 def test_a_room_that_photos_see_from_inside_stays(share, filled):
     inside = []
 
