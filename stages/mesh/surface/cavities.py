@@ -35,7 +35,7 @@ def fill_cavities(occupancy: np.ndarray, seen: Callable[[np.ndarray], np.ndarray
     asked = places[:: -(-len(places) // SAMPLES)]
     part = number[tuple(asked.T)]
     share = np.bincount(part, seen(asked), count + 1) / np.maximum(np.bincount(part, minlength=count + 1), 1)
-    hidden = inside & (share <= MAX_SEEN)
+    hidden = inside & (share <= MAX_SEEN)  # so is what is too small to be asked for
     elsewhere = _dilated((number > 0) & ~hidden[number], RADIUS)
     cavities = _dilated(hidden[number], RADIUS)
     for _ in range(CORNERS):
