@@ -28,8 +28,8 @@ class EffectParts(NamedTuple):
 
 class Effect(NamedTuple):
     """``load`` imports its parts, which need torch. ``part_of_the_method``: the published method has it, so it is left
-    out only where that gains; others are added only where that does. ``has_lookalike``: something else
-    may look like it, so that where its statistic is clear an A/B run may still speak against it."""
+    out only where that gains; others are added only where that does. ``has_lookalike``: something else may look
+    like it, so that where its statistic is clear an A/B run may still speak against it."""
 
     name: str
     description: str

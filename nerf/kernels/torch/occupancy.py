@@ -48,7 +48,7 @@ def binary_occupancy(bits: Int64[Tensor, "bricks"]) -> BinaryOccupancy:
     return BinaryOccupancy(bits, clear.flatten())
 
 
-def grown(reached: Bool[Tensor, "side side side"]) -> Bool[Tensor, "side side side"]:
+def grown(reached: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x y z"]:
     """Cells with all their neighbours, across edges and corners too."""
     for axis in range(3):
         wider, last = reached.clone(), reached.shape[axis] - 1

@@ -9,7 +9,10 @@ morphological opening, Serra 1982, "Image Analysis and Mathematical Morphology")
 from collections.abc import Callable
 
 import numpy as np
+import torch
 from scipy.ndimage import label
+
+from nerf.kernels.torch.occupancy import grown
 
 RADIUS = 3  # grid points: pits that led into a cavity were four to six wide (docs/experiments/mesh.md)
 CORNERS = 3  # grid points, from a cavity on, into corners where no cube fits
@@ -54,11 +57,7 @@ def _labelled(marked: np.ndarray) -> tuple[np.ndarray, int]:
 
 def _dilated(marked: np.ndarray, radius: int) -> np.ndarray:
     """All points in cubes of (2 radius + 1)³ around the marked ones, as far as they lie in the grid."""
-    for axis in range(3):
-        for _ in range(radius):
-            grown = marked.copy()
-            to, of = np.moveaxis(grown, axis, 0), np.moveaxis(marked, axis, 0)
-            to[1:] |= of[:-1]
-            to[:-1] |= of[1:]
-            marked = grown
-    return marked
+    found = torch.from_numpy(marked)
+    for _ in range(radius):
+        found = grown(found)
+    return found.numpy()
